@@ -1,0 +1,26 @@
+"""The entry of the ``rosasync`` command and of ``python -m rosasync``."""
+
+from __future__ import annotations
+
+import sys
+
+__all__ = ["main"]
+
+
+def main() -> None:
+    """Run the command line, or say which extra it needs and exit with 2."""
+    try:
+        from rosasync.cli import app
+    except ModuleNotFoundError as error:
+        if error.name not in {"rich", "typer"}:
+            raise
+        print(
+            f"The rosasync command needs {error.name}: pip install 'rosasync[cli]'",
+            file=sys.stderr,
+        )
+        sys.exit(2)
+    app()
+
+
+if __name__ == "__main__":
+    main()

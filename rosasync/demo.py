@@ -1,0 +1,387 @@
+"""``rosasync demo``: rosasync beside threaded ``client.call``, against a stock rclpy server."""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import json
+import math
+import platform
+import statistics
+import sys
+import threading
+import time
+from collections.abc import AsyncIterator, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import asynccontextmanager, contextmanager
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING
+
+from rich.bar import Bar
+from rich.console import Console, Group
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+import rosasync
+from rosasync.ros.domain import isolate
+
+if TYPE_CHECKING:
+    from rosasync.ros.stock import ThreadedClient
+
+__all__ = ["DemoError", "Figures", "Report", "run_demo"]
+
+OURS, STOCK = "rosasync", "client.call"
+SRV_NAMES = {OURS: "/rosasync_demo/ours", STOCK: "/rosasync_demo/stock"}
+"""A name for each: clients that share one are woken by each other's responses."""
+
+AT_ONCE = (1, 10)
+ROUNDS = 10
+WARM_UP = 20
+CALL_TIMEOUT = 3.0
+START_LIMIT, END_LIMIT = 7.0, 1.5
+"""Seconds for start-up, and for the server to end once asked, before it is killed."""
+
+
+class DemoError(Exception):
+    """The demo could not be run to its end; the message says why."""
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What was measured of one contestant."""
+
+    median_us: float
+    p99_us: float
+    calls_per_s: float
+    cpu_us_per_call: float
+
+    def ratios(self, other: Figures) -> dict[str, float]:
+        """Return each figure divided by the other's."""
+        return {
+            "median": self.median_us / other.median_us,
+            "p99": self.p99_us / other.p99_us,
+            "calls_per_s": self.calls_per_s / other.calls_per_s,
+            "cpu_per_call": self.cpu_us_per_call / other.cpu_us_per_call,
+        }
+
+
+@dataclass
+class Samples:
+    """The calls of one contestant, from all rounds.
+
+    Attributes:
+        latencies: seconds of each call.
+        wall: seconds that the rounds took.
+        cpu: seconds of CPU that this process used in them, all of its threads together.
+    """
+
+    latencies: list[float] = field(default_factory=list)
+    wall: float = 0.0
+    cpu: float = 0.0
+
+    @contextmanager
+    def measure(self) -> Iterator[None]:
+        """Add what passes inside to ``wall`` and ``cpu``."""
+        wall, cpu = time.perf_counter(), time.process_time()
+        yield
+        self.wall += time.perf_counter() - wall
+        self.cpu += time.process_time() - cpu
+
+    def figures(self) -> Figures:
+        """Return the figures; there must be samples."""
+        calls = len(self.latencies)
+        ordered = sorted(self.latencies)
+        return Figures(
+            median_us=round(1e6 * statistics.median(ordered), 2),
+            p99_us=round(1e6 * _percentile_99(ordered), 2),
+            calls_per_s=round(calls / self.wall, 2),
+            cpu_us_per_call=round(1e6 * self.cpu / calls, 2),
+        )
+
+
+@dataclass(frozen=True)
+class Report:
+    """What the demo measured, by contestant and number of calls at once."""
+
+    bridge: str
+    samples: dict[tuple[str, int], Samples]
+
+    def as_json(self) -> str:
+        """Return the figures and ratios as a JSON object."""
+        contests = []
+        for at_once in AT_ONCE:
+            contest: dict[str, object] = {"at_once": at_once}
+            for name in (OURS, STOCK):
+                samples = self.samples[name, at_once]
+                contest[name] = {"calls": len(samples.latencies), **asdict(samples.figures())}
+            contests.append({**contest, "ratio": self._ratios(at_once)})
+        machine = {"python": platform.python_version(), "platform": platform.platform()}
+        return json.dumps({"bridge": self.bridge, **machine, "contests": contests}, indent=2)
+
+    def as_text(self) -> Group:
+        """Return the table and the histogram, for a rich console."""
+        return Group(self._table(), "", self._histogram(), self._legend())
+
+    def _table(self) -> Table:
+        table = Table(title="The same service calls, to the same stock rclpy server")
+        table.add_column("calls at once", justify="right")
+        table.add_column("made with")
+        for heading in ("median", "99 %", "calls/s", "CPU per call"):
+            table.add_column(heading, justify="right")
+        for at_once in AT_ONCE:
+            ours, stock = (self.samples[name, at_once].figures() for name in (OURS, STOCK))
+            ratios = (f"{ratio:.2f}" for ratio in self._ratios(at_once).values())
+            table.add_row(str(at_once), OURS, *_cells(ours), style="bold")
+            table.add_row("", STOCK, *_cells(stock))
+            table.add_row("", "ratio", *ratios, end_section=True)
+        return table
+
+    def _histogram(self) -> Table:
+        ours, stock = (self.samples[name, 1].latencies for name in (OURS, STOCK))
+        edges = _edges([*ours, *stock], bins=12)
+        shares = [_shares(latencies, edges) for latencies in (ours, stock)]
+        longest = max(max(column) for column in shares)
+        table = Table(title="Latency, one call at a time", box=None)
+        table.add_column("from", justify="right")
+        for name in (OURS, STOCK):
+            table.add_column(name, width=28)
+        for edge, *row in zip(edges, *shares, strict=True):
+            bars = (Bar(longest, 0, share, width=28) for share in row)
+            table.add_row(f"{1e6 * edge:,.0f} µs", *bars)
+        return table
+
+    def _ratios(self, at_once: int) -> dict[str, float]:
+        ours, stock = (self.samples[name, at_once].figures() for name in (OURS, STOCK))
+        return ours.ratios(stock)
+
+    def _legend(self) -> str:
+        calls = sum(len(samples.latencies) for samples in self.samples.values())
+        return (
+            f"\n{calls:,} calls, each answered with its own text."
+            f"\n{OURS}: one session, the {self.bridge} bridge."
+            f"\n{STOCK}: threads beside a SingleThreadedExecutor."
+            "\nCPU: of the calling process, all its threads."
+            f"\nratio: {OURS} / {STOCK}."
+        )
+
+
+def _cells(figures: Figures) -> tuple[str, ...]:
+    return (
+        f"{figures.median_us:,.0f} µs",
+        f"{figures.p99_us:,.0f} µs",
+        f"{figures.calls_per_s:,.0f}",
+        f"{figures.cpu_us_per_call:,.0f} µs",
+    )
+
+
+def _percentile_99(ordered: list[float]) -> float:
+    return ordered[math.ceil(0.99 * len(ordered)) - 1]
+
+
+def _edges(latencies: list[float], bins: int) -> list[float]:
+    """Return the lower edges of bins that grow by a constant factor, up to the 99th percentile."""
+    ordered = sorted(latencies)
+    low, high = ordered[0], _percentile_99(ordered)
+    return [low * (high / low) ** (n / bins) for n in range(bins + 1)]
+
+
+def _shares(latencies: list[float], edges: list[float]) -> list[float]:
+    """Return the share of the latencies from each edge to the next; the last bin is open."""
+    ends = [*edges[1:], math.inf]
+    return [
+        sum(low <= latency < high for latency in latencies) / len(latencies)
+        for low, high in zip(edges, ends, strict=True)
+    ]
+
+
+def run_demo(*, calls: int = 2000, seconds: float = 8.0, as_json: bool = False) -> None:
+    """Run the demo and print what it measured to standard output; progress goes to stderr.
+
+    Takes over the main thread and puts the process into a ROS domain of its own.
+
+    Args:
+        calls: calls of each contestant, one at a time, and as many again ten at once.
+        seconds: most seconds to measure; on a slow machine fewer calls are made.
+        as_json: print a JSON object instead of a table and a histogram.
+
+    Raises:
+        DemoError: the calls could not be made, or one was answered wrongly.
+        KeyboardInterrupt: after Ctrl-C; the server process has ended by then.
+    """
+    isolate()
+    try:
+        report = asyncio.run(_run(calls, seconds))
+    except ImportError as error:
+        raise DemoError(str(error)) from error
+    except rosasync.RosasyncError as error:
+        raise DemoError(f"{type(error).__name__}: {error}") from error
+    except TimeoutError as error:
+        raise DemoError(f"out of time ({error or 'is this machine busy?'})") from error
+    if as_json:
+        print(report.as_json())
+        return
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # bars and µ on a terminal without Unicode
+    Console(highlight=False).print(report.as_text())
+
+
+async def _run(calls: int, seconds: float) -> Report:
+    async with (
+        asyncio.timeout(START_LIMIT + seconds),
+        rosasync.Session("rosasync_demo", timeout=CALL_TIMEOUT) as session,
+        _stock_server(),
+        _stock_client() as client,
+    ):
+        with ThreadPoolExecutor(max(AT_ONCE)) as threads:
+            contestants = _Contestants(session, client, threads)
+            return Report(session.bridge, await _measure(contestants, calls, seconds))
+
+
+@asynccontextmanager
+async def _stock_server() -> AsyncIterator[None]:
+    """Run the server in a process of its own, out of reach of the terminal's Ctrl-C."""
+    from rosasync.ros.stock import READY
+
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "rosasync.ros.stock", *SRV_NAMES.values()),
+        stdin=asyncio.subprocess.PIPE,
+        stdout=asyncio.subprocess.PIPE,
+        start_new_session=True,
+    )
+    assert process.stdin is not None
+    assert process.stdout is not None
+    try:
+        if await process.stdout.readline() != READY:
+            raise DemoError("the server process ended before it was ready")
+        yield
+    finally:
+        process.stdin.close()
+        try:
+            async with asyncio.timeout(END_LIMIT):
+                await process.wait()
+        except TimeoutError:
+            process.kill()
+            await process.wait()
+
+
+@asynccontextmanager
+async def _stock_client() -> AsyncIterator[ThreadedClient]:
+    from rosasync.ros.stock import ThreadedClient
+
+    client = ThreadedClient(SRV_NAMES[STOCK])
+    try:
+        if not await asyncio.to_thread(client.wait_for_service, CALL_TIMEOUT):
+            raise DemoError(f"{STOCK} does not see the server")
+        yield client
+    finally:
+        client.close()
+
+
+@dataclass(frozen=True)
+class _Contestants:
+    session: rosasync.Session
+    client: ThreadedClient
+    threads: ThreadPoolExecutor
+
+
+async def _measure(
+    contestants: _Contestants, calls: int, seconds: float
+) -> dict[tuple[str, int], Samples]:
+    """Let the contestants take turns, each for an equal part of the time that is left."""
+    samples = {(name, at_once): Samples() for at_once in AT_ONCE for name in (OURS, STOCK)}
+    turns = [turn for _ in range(ROUNDS) for turn in samples]
+    end = time.perf_counter() + seconds
+    for name, at_once in samples:
+        await _take_turn(contestants, name, at_once, WARM_UP, end, Samples())
+    with _progress() as progress:
+        task = progress.add_task("", total=len(turns))
+        for done, (name, at_once) in enumerate(turns):
+            progress.update(task, completed=done, description=f"{name}, {at_once} at once")
+            progress.refresh()
+            now = time.perf_counter()
+            until = now + (end - now) / (len(turns) - done)
+            await _take_turn(
+                contestants, name, at_once, calls // ROUNDS, until, samples[name, at_once]
+            )
+    return samples
+
+
+def _progress() -> Progress:
+    # Refreshed between turns only: a bar that redraws itself would be measured along.
+    console = Console(stderr=True)
+    return Progress(
+        TextColumn("{task.description:24}"),
+        BarColumn(),
+        TimeElapsedColumn(),
+        console=console,
+        auto_refresh=False,
+        transient=True,
+        disable=not console.is_terminal,
+    )
+
+
+async def _take_turn(
+    contestants: _Contestants, name: str, at_once: int, calls: int, until: float, into: Samples
+) -> None:
+    """Make the calls, ``at_once`` callers sharing them, or fewer where ``until`` comes first."""
+    calls = max(calls, at_once)
+    shares = [range(caller, calls, at_once) for caller in range(at_once)]
+    turn = _our_turn if name == OURS else _stock_turn
+    with into.measure():
+        await turn(contestants, shares, until, into.latencies)
+
+
+async def _our_turn(
+    contestants: _Contestants, shares: Iterable[range], until: float, latencies: list[float]
+) -> None:
+    from rosasync.ros.stock import Echo, answer_of, request_for
+
+    async def caller(numbers: range) -> None:
+        for number in numbers:
+            start = time.perf_counter()
+            request = request_for(str(number))
+            response = await contestants.session.call(Echo, SRV_NAMES[OURS], request)
+            now = time.perf_counter()
+            latencies.append(now - start)
+            _check(answer_of(response), str(number))
+            if now > until:
+                return
+
+    try:
+        async with asyncio.TaskGroup() as group:
+            for numbers in shares:
+                group.create_task(caller(numbers))
+    except ExceptionGroup as errors:
+        raise errors.exceptions[0] from None
+
+
+async def _stock_turn(
+    contestants: _Contestants, shares: Iterable[range], until: float, latencies: list[float]
+) -> None:
+    from rosasync.ros.stock import answer_of, request_for
+
+    stop = threading.Event()
+
+    def caller(numbers: range) -> None:
+        for number in numbers:
+            start = time.perf_counter()
+            request = request_for(str(number))
+            response = contestants.client.call(request, CALL_TIMEOUT)
+            now = time.perf_counter()
+            latencies.append(now - start)
+            _check(answer_of(response), str(number))
+            if now > until or stop.is_set():
+                return
+
+    loop = asyncio.get_running_loop()
+    try:
+        await asyncio.gather(
+            *(loop.run_in_executor(contestants.threads, caller, numbers) for numbers in shares)
+        )
+    finally:
+        stop.set()
+
+
+def _check(answer: str, text: str) -> None:
+    if answer != text:
+        raise DemoError(f"asked for {text!r} to be echoed, got {answer!r}")

@@ -1,0 +1,699 @@
+"""ClientPool: hands out clients per (url, type) and takes them back after each await."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import OrderedDict
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from rosasync.client import Client, Counts, Expired
+from rosasync.errors import (
+    CallError,
+    ContextShutdown,
+    PoolFull,
+    QueueTimeout,
+    ResponseTimeout,
+    ServerGone,
+    ServiceUnavailable,
+    UsageError,
+)
+from rosasync.limits import (
+    KeyStatistics,
+    Limits,
+    PoolStatistics,
+    Retry,
+    ServiceKey,
+    Timeout,
+    check_count,
+    check_timeout,
+)
+
+if TYPE_CHECKING:
+    from rosasync.ros.ports import NodePort
+
+__all__ = ["ClientPool", "LeasedClient"]
+
+T = TypeVar("T")
+
+logger = logging.getLogger("rosasync")
+
+FIRST_LOOK = 0.002
+"""Seconds until a new client is first looked at; matching it with a server takes milliseconds."""
+LAST_LOOK = 0.25
+"""Seconds between looks at the most, while somebody waits for a server."""
+CONTEXT_LOOK = 0.5
+"""Seconds between looks at the context, while a request is out: a signal handler of rclpy shuts it
+down without telling anybody."""
+LAST_WORDS = 0.02
+"""Seconds for a response that a server sent before it vanished to come through after the news."""
+MATCHING = 1.0
+"""Seconds for a new client to find a server that the graph already shows."""
+
+
+class Endpoint:
+    """All the pool knows of one service: its clients, who waits for one, what happened so far."""
+
+    __slots__ = (
+        "clients",
+        "counts",
+        "gone",
+        "key",
+        "qos",
+        "request_type",
+        "srv_name",
+        "srv_type",
+        "turns",
+        "waiters",
+        "warned",
+        "watchers",
+    )
+
+    def __init__(self, key: ServiceKey, srv_type: Any, srv_name: str, qos: Any) -> None:
+        self.key = key
+        self.srv_type = srv_type
+        self.request_type: type = srv_type.Request
+        # As given: rclpy resolves it, and a remapping must not be applied twice.
+        self.srv_name = srv_name
+        self.qos = qos
+        self.clients: list[Client] = []
+        self.waiters: OrderedDict[asyncio.Future[Client], None] = OrderedDict()
+        self.watchers: dict[asyncio.Future[None], None] = {}
+        self.turns: dict[asyncio.Future[None], Client] = {}
+        self.counts = Counts()
+        self.gone: asyncio.TimerHandle | None = None
+        self.warned = False
+
+    def __repr__(self) -> str:
+        return (
+            f"<Endpoint {self.key.srv_name} {len(self.clients)} clients, "
+            f"{self.counts.in_flight} in flight, {len(self.waiters)} waiting>"
+        )
+
+    @property
+    def has_callers(self) -> bool:
+        """Whether somebody waits for a server or a place."""
+        return bool(self.waiters or self.watchers or self.turns)
+
+    @property
+    def has_requests(self) -> bool:
+        """Whether a request is out, wanted or abandoned."""
+        return bool(self.counts.in_flight) or any(c.abandoned for c in self.clients)
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether somebody waits for anything."""
+        return self.has_callers or self.has_requests
+
+    def error(self, kind: type[CallError], message: str, elapsed: float) -> CallError:
+        """Make an error about a call of this service."""
+        name, type_name, _ = self.key
+        return kind(f"{name}: {message}", srv_name=name, srv_type=type_name, elapsed=elapsed)
+
+    def statistics(self) -> KeyStatistics:
+        """Take a snapshot."""
+        return KeyStatistics(
+            clients=len(self.clients),
+            idle=sum(client.is_idle for client in self.clients),
+            waiting=len(self.waiters),
+            abandoned=sum(client.abandoned for client in self.clients),
+            **asdict(self.counts),
+        )
+
+
+class ClientPool:
+    """Hands out clients per (url, type) and takes them back after each await.
+
+    A session's, as ``session.pool``. Confined to the loop's thread: its state changes only
+    between awaits, so there is no lock.
+    """
+
+    def __init__(self, node: NodePort, limits: Limits, timeout: float | None = None) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._node = node
+        self._limits = limits
+        self._timeout = timeout
+        self._endpoints: dict[ServiceKey, Endpoint] = {}
+        self._shortcuts: dict[tuple[Any, str, Any], Endpoint] = {}
+        self._graph = 0
+        self._look_timer: asyncio.TimerHandle | None = None
+        self._look_delay = FIRST_LOOK
+        self._evict_timer: asyncio.TimerHandle | None = None
+        self._ending: Callable[[], Exception] | None = None
+
+    def __repr__(self) -> str:
+        total = self.statistics()
+        return (
+            f"<ClientPool {len(self._endpoints)} services, {total.clients} clients, "
+            f"{total.idle} idle, {total.in_flight} in flight, {total.waiting} waiting>"
+        )
+
+    @asynccontextmanager
+    async def lease(
+        self, srv_type: Any, srv_name: str, *, qos: Any = None, timeout: Timeout = ...
+    ) -> AsyncIterator[LeasedClient]:
+        """Hand out a client and take it back on every way out.
+
+        A lease holds one place in the client's window: it carries one call at a time.
+
+        Args:
+            srv_type: a service class or its name.
+            srv_name: the service's name.
+            qos: a ``QoSProfile``; None for the service default with a history of 1,000.
+            timeout: seconds to wait for a client, None for no deadline; the session's where it is
+                left out.
+
+        Raises:
+            ServiceUnavailable: no server was there in time.
+            QueueTimeout: every client stayed taken.
+            PoolFull: as many callers as allowed are waiting already.
+            SessionClosed: the session is closed.
+        """
+        endpoint = self.endpoint(srv_type, srv_name, qos)
+        started = self._loop.time()
+        seconds = check_timeout(timeout, self._timeout)
+        deadline = None if seconds is None else started + seconds
+        try:
+            client = self._lease_any(endpoint) or await self._queue(endpoint, deadline)
+        except Expired:
+            raise self._unreached(endpoint, started) from None
+        leased = LeasedClient(self, endpoint, client)
+        try:
+            yield leased
+        finally:
+            leased.closed = True
+            self._release(endpoint, client)
+
+    async def warm(self, srv_type: Any, srv_name: str, clients: int = 1) -> None:
+        """Make clients ahead of the first call, and match them with the server if there is one.
+
+        Args:
+            srv_type: a service class or its name.
+            srv_name: the service's name.
+            clients: how many there shall be, at most ``Limits.clients``.
+
+        Raises:
+            ValueError: more clients than ``Limits.clients`` allows.
+            SessionClosed: the session is closed.
+        """
+        most = self._limits.clients
+        if check_count("clients", clients, 1) > most:
+            raise ValueError(f"clients={clients} is more than Limits.clients={most}")
+        endpoint = self.endpoint(srv_type, srv_name, None)
+        while len(endpoint.clients) < clients:
+            self._open(endpoint)
+            await asyncio.sleep(0)
+        patience = self._loop.time() + MATCHING
+        while self._provided(endpoint) and self._loop.time() < patience:
+            if all(self._is_matched(endpoint, client) for client in endpoint.clients):
+                break
+            await asyncio.sleep(FIRST_LOOK)
+
+    def statistics(self) -> PoolStatistics:
+        """Take a snapshot of the pool, in all and for each service."""
+        keys = {key: endpoint.statistics() for key, endpoint in self._endpoints.items()}
+        names = KeyStatistics.__dataclass_fields__
+        total = {name: sum(getattr(s, name) for s in keys.values()) for name in names}
+        return PoolStatistics(**total, keys=keys)
+
+    # What follows serves the session.
+
+    def endpoint(self, srv_type: Any, srv_name: str, qos: Any) -> Endpoint:
+        """Return the endpoint for a service, made at its first use.
+
+        Raises:
+            TypeError, ValueError: there is no such service type.
+            InvalidServiceName: ROS does not allow the name.
+            SessionClosed, ContextShutdown: the session has ended.
+        """
+        shortcut = (srv_type, srv_name, qos if qos is None else id(qos))
+        try:
+            return self._shortcuts[shortcut]
+        except (KeyError, TypeError):
+            self._check_open()
+        srv_class, type_name, qos_key = self._node.describe(srv_type, qos)
+        key = ServiceKey(self._node.resolve(srv_name), type_name, qos_key)
+        endpoint = self._endpoints.get(key)
+        if endpoint is None:
+            endpoint = self._endpoints[key] = Endpoint(key, srv_class, srv_name, qos)
+        if qos is None:
+            self._shortcuts[shortcut] = endpoint
+        return endpoint
+
+    def request(self, endpoint: Endpoint, request: Any) -> Any:
+        """Return a message of the request type, made from a mapping or None where it has to be.
+
+        Raises:
+            TypeError, ValueError: it does not fit.
+        """
+        if isinstance(request, endpoint.request_type):
+            return request
+        return self._node.request(endpoint.srv_type, request)
+
+    async def call(
+        self,
+        endpoint: Endpoint,
+        request: Any,
+        timeout: float | None,
+        wait: bool = True,
+        retry: Retry | None = None,
+    ) -> Any:
+        """Lease a client, call, and take it back."""
+        started = self._loop.time()
+        deadline = None if timeout is None else started + timeout
+        try:
+            client = self._lease_any(endpoint)
+            if client is None:
+                client = await self._reach(endpoint, started, deadline, wait)
+            try:
+                response = await client.call(request, deadline, retry)
+            finally:
+                self._release(endpoint, client)
+        except BaseException as error:
+            raise self._account(endpoint, error, started) from None
+        endpoint.counts.completed += 1
+        return response
+
+    async def wait_for_server(self, endpoint: Endpoint, timeout: float | None) -> None:
+        """Wait until a server is matched.
+
+        Raises:
+            ServiceUnavailable: none was, in time.
+        """
+        started = self._loop.time()
+        deadline = None if timeout is None else started + timeout
+        if not self.is_ready(endpoint):
+            watcher: asyncio.Future[None] = self._loop.create_future()
+            endpoint.watchers[watcher] = None
+            try:
+                await self._wait(endpoint, watcher, deadline)
+            except Expired:
+                raise self._unavailable(endpoint, self._loop.time() - started) from None
+            finally:
+                del endpoint.watchers[watcher]
+
+    def is_ready(self, endpoint: Endpoint) -> bool:
+        """Tell whether a client of this service is matched with a server."""
+        self._check_open()
+        if not endpoint.clients:
+            self._open(endpoint)
+        if self._look_timer is None:
+            self._keep_looking()
+        return any(self._is_matched(endpoint, client) for client in endpoint.clients)
+
+    def graph_changed(self) -> None:
+        """Look who is affected by a change of the ROS graph."""
+        self._graph += 1
+        self._look()
+        if any(self._awaits_match(endpoint) for endpoint in self._endpoints.values()):
+            self._look_soon()
+
+    def end(self, ending: Callable[[], Exception]) -> None:
+        """End every call with the error ``ending`` makes, and destroy the clients; idempotent."""
+        if self._ending is not None:
+            return
+        self._ending = ending
+        for timer in (self._look_timer, self._evict_timer):
+            if timer is not None:
+                timer.cancel()
+        for endpoint in self._endpoints.values():
+            callers: tuple[asyncio.Future[Any], ...] = (
+                *endpoint.waiters,
+                *endpoint.watchers,
+                *endpoint.turns,
+            )
+            for future in callers:
+                if not future.done():
+                    future.set_exception(ending())
+            if endpoint.gone is not None:
+                endpoint.gone.cancel()
+            for client in endpoint.clients:
+                client.fail(ending)
+                client.close()
+            endpoint.clients.clear()
+        self._shortcuts.clear()
+
+    async def call_leased(
+        self,
+        endpoint: Endpoint,
+        client: Client,
+        request: Any,
+        timeout: Timeout,
+        retry: Retry | None,
+    ) -> Any:
+        """Call with a client that the caller leases."""
+        message = self.request(endpoint, request)
+        seconds = check_timeout(timeout, self._timeout)
+        started = self._loop.time()
+        deadline = None if seconds is None else started + seconds
+        try:
+            self._check_open()
+            try:
+                await self._take_turn(endpoint, client, deadline)
+            except Expired:
+                raise self._unreached(endpoint, started) from None
+            response = await client.call(message, deadline, retry)
+        except BaseException as error:
+            raise self._account(endpoint, error, started) from None
+        endpoint.counts.completed += 1
+        return response
+
+    # Who gets a client.
+
+    def _lease_any(self, endpoint: Endpoint) -> Client | None:
+        """Lease a matched client that has room, unless others came first."""
+        if endpoint.waiters:
+            return None
+        if self._look_timer is None:
+            self._keep_looking()
+        for client in endpoint.clients:
+            if client.graph == self._graph and client.room > 0:
+                client.leases += 1
+                return client
+        return None
+
+    def _assign(self, endpoint: Endpoint) -> bool:
+        """Decide who gets what; True where a client has to be made first.
+
+        1. A matched client with room goes to the first in line.
+        2. Where the rest of the line is longer than what clients being matched will hold, and the
+           limit allows, one more client is needed.
+        3. Else the line waits: for a release, a late response, or a match.
+        """
+        while endpoint.waiters:
+            coming = 0
+            for client in endpoint.clients:
+                if client.room > 0:
+                    if self._is_matched(endpoint, client):
+                        break
+                    coming += client.room
+            else:
+                return len(endpoint.clients) < self._limits.clients and coming < len(
+                    endpoint.waiters
+                )
+            waiter, _ = endpoint.waiters.popitem(last=False)
+            if not waiter.done():
+                client.leases += 1
+                waiter.set_result(client)
+        return False
+
+    def _serve_line(self, endpoint: Endpoint) -> None:
+        for turn, client in tuple(endpoint.turns.items()):
+            if client.room >= 0 and not turn.done() and self._is_matched(endpoint, client):
+                turn.set_result(None)
+        while self._assign(endpoint):
+            self._open(endpoint)
+
+    async def _queue(self, endpoint: Endpoint, deadline: float | None) -> Client:
+        """Stand in line for a client.
+
+        Raises:
+            Expired: the deadline passed.
+            PoolFull: the line is as long as allowed.
+        """
+        self._check_open()
+        waiter: asyncio.Future[Client] = self._loop.create_future()
+        endpoint.waiters[waiter] = None
+        self._serve_line(endpoint)
+        if not waiter.done():
+            # Who gets a place as soon as a client is matched is not in anybody's way.
+            coming = sum(c.room for c in endpoint.clients if c.graph != self._graph)
+            if len(endpoint.waiters) > self._limits.waiting + max(coming, 0):
+                del endpoint.waiters[waiter]
+                raise PoolFull(
+                    f"{endpoint.key.srv_name}: {len(endpoint.waiters)} callers are waiting for a "
+                    f"client, Limits.waiting={self._limits.waiting} allows no more"
+                )
+        try:
+            return await self._wait(endpoint, waiter, deadline)
+        except BaseException:
+            if waiter.done() and not waiter.cancelled() and waiter.exception() is None:
+                self._release(endpoint, waiter.result())
+            raise
+        finally:
+            endpoint.waiters.pop(waiter, None)
+
+    async def _reach(
+        self, endpoint: Endpoint, started: float, deadline: float | None, wait: bool
+    ) -> Client:
+        """Wait for a client that is matched with a server.
+
+        Raises:
+            ServiceUnavailable: there is no server, and ``wait`` is False or the deadline passed.
+            QueueTimeout: there is one, but no client became free.
+        """
+        self._check_open()
+        if not wait and not self.is_ready(endpoint):
+            if not self._provided(endpoint):
+                raise self._unavailable(endpoint, self._loop.time() - started)
+            await self.wait_for_server(endpoint, MATCHING)
+        try:
+            return await self._queue(endpoint, deadline)
+        except Expired:
+            raise self._unreached(endpoint, started) from None
+
+    async def _take_turn(self, endpoint: Endpoint, client: Client, deadline: float | None) -> None:
+        """Wait until a leased client is matched, and abandoned requests leave it a place.
+
+        Raises:
+            Expired: the deadline passed.
+        """
+        if client.room >= 0 and self._is_matched(endpoint, client):
+            return
+        turn: asyncio.Future[None] = self._loop.create_future()
+        endpoint.turns[turn] = client
+        try:
+            await self._wait(endpoint, turn, deadline)
+        finally:
+            del endpoint.turns[turn]
+
+    async def _wait(
+        self, endpoint: Endpoint, future: asyncio.Future[T], deadline: float | None
+    ) -> T:
+        """Wait for a future that `_look` or a release completes; `Expired` at the deadline."""
+        if future.done():
+            return future.result()
+        if self._awaits_match(endpoint):
+            self._look_soon()
+        timer = None if deadline is None else self._loop.call_at(deadline, _expire, future)
+        try:
+            return await future
+        finally:
+            if timer is not None:
+                timer.cancel()
+
+    def _release(self, endpoint: Endpoint, client: Client) -> None:
+        client.leases -= 1
+        if self._ending is not None:
+            return
+        if endpoint.waiters:
+            self._serve_line(endpoint)
+        client.idle_since = self._loop.time()
+        if self._evict_timer is None:
+            self._evict_timer = self._loop.call_later(self._limits.idle, self._evict)
+
+    # Making and destroying clients.
+
+    def _open(self, endpoint: Endpoint) -> None:
+        self._check_open()
+
+        def on_room() -> None:
+            if endpoint.waiters or endpoint.turns:
+                self._serve_line(endpoint)
+
+        client = Client(
+            lambda deliver: self._node.open_client(
+                endpoint.srv_type, endpoint.srv_name, endpoint.qos, deliver
+            ),
+            self._limits,
+            endpoint.counts,
+            on_room,
+        )
+        endpoint.clients.append(client)
+        endpoint.counts.created += 1
+
+    def _evict(self) -> None:
+        now = self._loop.time()
+        soonest: float | None = None
+        for endpoint in self._endpoints.values():
+            for client in tuple(endpoint.clients):
+                ends = client.idle_since + self._limits.idle
+                if ends <= now and client.is_idle and not endpoint.has_callers:
+                    endpoint.clients.remove(client)
+                    client.close()
+                elif client.is_idle:
+                    soonest = ends if soonest is None else min(soonest, ends)
+        self._evict_timer = None
+        if soonest is not None:
+            ends = max(soonest, now + 0.01)
+            self._evict_timer = self._loop.call_at(ends, self._evict)
+
+    # What the graph shows.
+
+    def _is_matched(self, endpoint: Endpoint, client: Client) -> bool:
+        if client.graph == self._graph:
+            return True
+        if not client.ready():
+            return False
+        client.graph = self._graph
+        if not endpoint.warned and (servers := self._node.servers(endpoint.key.srv_name)) > 1:
+            endpoint.warned = True
+            logger.warning(
+                "%s: %d servers answer this name; the first response wins and the others are "
+                "dropped",
+                endpoint.key.srv_name,
+                servers,
+            )
+        return True
+
+    def _provided(self, endpoint: Endpoint) -> bool:
+        return self._node.provides(endpoint.key.srv_type, endpoint.key.srv_name)
+
+    def _awaits_match(self, endpoint: Endpoint) -> bool:
+        """Tell whether somebody waits for a client to be matched, not just for a place."""
+        return bool(endpoint.watchers) or (
+            bool(endpoint.waiters or endpoint.turns)
+            and any(client.graph != self._graph for client in endpoint.clients)
+        )
+
+    def _look_soon(self) -> None:
+        """Look every few milliseconds at first: the match itself is not an event of the graph."""
+        if self._look_timer is not None:
+            self._look_timer.cancel()
+        self._look_delay = FIRST_LOOK
+        self._look_timer = self._loop.call_later(FIRST_LOOK, self._on_look_timer)
+
+    def _keep_looking(self) -> None:
+        """Look at the context now and then, until a look finds that nothing is out."""
+        if not self._node.graph_events:
+            self._graph += 1
+        self._look_timer = self._loop.call_later(CONTEXT_LOOK, self._on_look_timer)
+
+    def _on_look_timer(self) -> None:
+        self._look_timer = None
+        if not self._node.ok():
+            self.end(lambda: ContextShutdown("the rclpy context was shut down"))
+            return
+        if not self._node.graph_events:
+            self._graph += 1
+        self._look()
+        endpoints = self._endpoints.values()
+        if any(self._awaits_match(endpoint) for endpoint in endpoints):
+            self._look_delay = min(self._look_delay * 2, LAST_LOOK)
+            self._look_timer = self._loop.call_later(self._look_delay, self._on_look_timer)
+        elif any(endpoint.is_busy for endpoint in endpoints):
+            self._look_timer = self._loop.call_later(CONTEXT_LOOK, self._on_look_timer)
+
+    def _look(self) -> None:
+        for endpoint in self._endpoints.values():
+            if endpoint.has_callers:
+                self._serve_line(endpoint)
+                if endpoint.watchers and self.is_ready(endpoint):
+                    for watcher in endpoint.watchers:
+                        if not watcher.done():
+                            watcher.set_result(None)
+            if (
+                endpoint.gone is None
+                and endpoint.has_requests
+                and not self._node.servers(endpoint.key.srv_name)
+            ):
+                endpoint.gone = self._loop.call_later(LAST_WORDS, self._server_gone, endpoint)
+
+    def _server_gone(self, endpoint: Endpoint) -> None:
+        endpoint.gone = None
+        if not self._node.servers(endpoint.key.srv_name):
+            self._graph += 1
+            for client in endpoint.clients:
+                client.fail(_Gone)
+
+    # Errors.
+
+    def _check_open(self) -> None:
+        if self._ending is not None:
+            raise self._ending()
+
+    def _unavailable(self, endpoint: Endpoint, elapsed: float) -> CallError:
+        name, type_name, _ = endpoint.key
+        seen = self._node.seen_instead(type_name, name)
+        message = f"no server for {type_name} after {elapsed:.3g} s; {seen}"
+        return endpoint.error(ServiceUnavailable, message, elapsed)
+
+    def _unreached(self, endpoint: Endpoint, started: float) -> CallError:
+        """Tell what a caller waited for in vain: a server, or a client where there is one."""
+        elapsed = self._loop.time() - started
+        if not self.is_ready(endpoint):
+            return self._unavailable(endpoint, elapsed)
+        message = (
+            f"no client became free within {elapsed:.3g} s: {endpoint.counts.in_flight} requests "
+            f"are in flight, {sum(c.abandoned for c in endpoint.clients)} abandoned ones still "
+            f"hold a place"
+        )
+        return endpoint.error(QueueTimeout, message, elapsed)
+
+    def _account(self, endpoint: Endpoint, error: BaseException, started: float) -> BaseException:
+        """Count how a call failed, and say it in the caller's terms."""
+        counts = endpoint.counts
+        elapsed = self._loop.time() - started
+        if isinstance(error, Expired):
+            message = f"sent, and not answered within {elapsed:.3g} s"
+            error = endpoint.error(ResponseTimeout, message, elapsed)
+        elif isinstance(error, _Gone):
+            message = "the last server vanished while the request was out"
+            error = endpoint.error(ServerGone, message, elapsed)
+        if isinstance(error, asyncio.CancelledError):
+            counts.cancelled += 1
+        elif isinstance(error, TimeoutError):
+            counts.timed_out += 1
+            logger.debug("%s", error)
+        else:
+            counts.failed += 1
+            logger.debug("%s: %r", endpoint.key.srv_name, error)
+        return error
+
+
+class LeasedClient:
+    """A client on loan: one call at a time, until the lease ends."""
+
+    __slots__ = ("_busy", "_client", "_endpoint", "_pool", "closed")
+
+    def __init__(self, pool: ClientPool, endpoint: Endpoint, client: Client) -> None:
+        self._pool = pool
+        self._endpoint = endpoint
+        self._client = client
+        self._busy = False
+        self.closed = False
+
+    def __repr__(self) -> str:
+        state = "closed" if self.closed else "busy" if self._busy else "idle"
+        return f"<LeasedClient {self._endpoint.key.srv_name} {state}>"
+
+    async def call(
+        self, request: Any = None, *, timeout: Timeout = ..., retry: Retry | None = None
+    ) -> Any:
+        """Call the service with this client; for the arguments and errors, see `Session.call`.
+
+        Raises:
+            UsageError: the lease is over, or another of its calls is under way.
+        """
+        if self.closed or self._busy:
+            state = "is over" if self.closed else "carries one call at a time"
+            raise UsageError(f"{self._endpoint.key.srv_name}: the lease {state}")
+        self._busy = True
+        try:
+            return await self._pool.call_leased(
+                self._endpoint, self._client, request, timeout, retry
+            )
+        finally:
+            self._busy = False
+
+
+class _Gone(Exception):
+    """The last server vanished."""
+
+
+def _expire(future: asyncio.Future[Any]) -> None:
+    if not future.done():
+        future.set_exception(Expired())

@@ -1,0 +1,117 @@
+"""The executor thread: spins rclpy, and brings what happens there to the loop."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import threading
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.executors import Executor, ExternalShutdownException, ShutdownException
+
+from rosasync.errors import SessionClosed
+
+__all__ = ["ExecutorThread", "Mailbox"]
+
+logger = logging.getLogger("rosasync")
+
+
+class Mailbox:
+    """Carries calls from any thread to the loop, with one wake-up for each batch."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._loop = loop
+        self._lock = threading.Lock()
+        self._calls: list[tuple[Callable[..., object], tuple[Any, ...]]] = []
+        self._closed = False
+
+    def post(self, callback: Callable[..., object], *args: Any) -> None:
+        """Have ``callback(*args)`` called on the loop's thread. Any thread may post.
+
+        Raises:
+            SessionClosed: the mailbox, or the loop, is closed.
+        """
+        with self._lock:
+            if self._closed or self._loop.is_closed():
+                raise SessionClosed("the session is closed")
+            self._calls.append((callback, args))
+            if len(self._calls) == 1:
+                self._loop.call_soon_threadsafe(self._drain)
+
+    def close(self) -> None:
+        """Take no more, and drop what has not been delivered."""
+        with self._lock:
+            self._closed = True
+            self._calls = []
+
+    def _drain(self) -> None:
+        with self._lock:
+            calls, self._calls = self._calls, []
+        for callback, args in calls:
+            try:
+                callback(*args)
+            except Exception as error:
+                self._loop.call_exception_handler(
+                    {"message": f"{callback!r} failed", "exception": error}
+                )
+
+
+class ExecutorThread:
+    """Spins an rclpy executor in a thread of its own.
+
+    An exception that a callback of the node raises is reported and does not end the spinning.
+    The thread is a daemon, so that it cannot keep the interpreter alive; whoever starts it joins
+    it before the interpreter's exit, which would abort on a thread still spinning.
+    """
+
+    def __init__(
+        self,
+        executor: Executor,
+        name: str,
+        on_error: Callable[[Exception], None],
+        on_shutdown: Callable[[], None],
+        on_end: Callable[[], None],
+    ) -> None:
+        self._executor = executor
+        self._on_error = on_error
+        self._on_shutdown = on_shutdown
+        self._on_end = on_end
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._spin, name=name, daemon=True)
+        self._thread.start()
+
+    @property
+    def ident(self) -> int | None:
+        """The thread's identifier, as ``threading.get_ident`` gives it."""
+        return self._thread.ident
+
+    def stop(self) -> None:
+        """Ask the thread to end, after the callback under way. Any thread; idempotent."""
+        self._stopping.set()
+        self._executor.wake()
+
+    def join(self, timeout: float) -> bool:
+        """Wait for the end, ``timeout`` seconds at the most; blocks.
+
+        Returns:
+            Whether the thread has ended.
+        """
+        if self._thread is threading.current_thread():
+            return False
+        self._thread.join(timeout)
+        return not self._thread.is_alive()
+
+    def _spin(self) -> None:
+        while not self._stopping.is_set():
+            try:
+                self._executor.spin_once()
+            except (ExternalShutdownException, ShutdownException):
+                break
+            except Exception as error:
+                if self._stopping.is_set() or not self._executor.context.ok():
+                    break
+                self._on_error(error)
+        if not self._stopping.is_set():
+            self._on_shutdown()
+        self._on_end()

@@ -1,0 +1,284 @@
+"""One node for a session: made or borrowed, with its executor thread, its bridge and its graph."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import difflib
+import logging
+from collections.abc import Callable, Hashable
+from typing import Any, Literal
+
+import rclpy
+from rclpy.context import Context
+from rclpy.exceptions import InvalidServiceNameException, InvalidTopicNameException
+from rclpy.executors import Executor, SingleThreadedExecutor
+from rclpy.expand_topic_name import expand_topic_name
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, qos_profile_services_default
+from rclpy.signals import SignalHandlerOptions
+from rclpy.validate_full_topic_name import validate_full_topic_name
+
+from rosasync.errors import InvalidServiceName, SessionClosed, UsageError
+from rosasync.ros import rcl
+from rosasync.ros.direct import DirectBridge
+from rosasync.ros.executor import ExecutorThread, Mailbox
+from rosasync.ros.futures import ExecutorBridge
+from rosasync.ros.graph import GraphWaitable
+from rosasync.ros.messages import request_message, service_type, type_name
+from rosasync.ros.ports import ClientPort, Deliver
+
+__all__ = ["RosNode"]
+
+logger = logging.getLogger("rosasync")
+
+DEPTH = 1000
+"""History of the default QoS: ten, rclpy's, is where requests and responses get lost."""
+
+DIRECT_TRIED = ("rmw_fastrtps_cpp", "rmw_fastrtps_dynamic_cpp")
+"""The middlewares on which ``bridge="auto"`` takes the direct bridge."""
+
+JOIN = 5.0
+"""Seconds for the executor thread to finish the callback under way."""
+
+
+class RosNode:
+    """What a session has of ROS. Made, used and closed on the loop's thread.
+
+    Args:
+        node: a name, for a node and a context of its own; or a node to borrow.
+        context: for a named node, the context to make it in, which is then not shut down.
+        executor: an executor its owner spins; the node is added to it and no thread started.
+        bridge: ``"auto"``, ``"direct"`` or ``"executor"``.
+        on_graph: called on the loop's thread at a change of the graph.
+        on_shutdown: called on the loop's thread when the context goes down.
+    """
+
+    def __init__(
+        self,
+        node: str | Node,
+        context: Context | None,
+        executor: Executor | None,
+        bridge: Literal["auto", "direct", "executor"],
+        on_graph: Callable[[], None],
+        on_shutdown: Callable[[], None],
+    ) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._mailbox = Mailbox(self._loop)
+        self._on_graph = on_graph
+        self._on_shutdown = on_shutdown
+        self._graph_pending = False
+        self._thread: ExecutorThread | None = None
+        self._thread_ended = asyncio.Event()
+        self._own_context: Context | None = None
+        self._own_executor: Executor | None = None
+        self._owned = isinstance(node, str)
+        self._waitable: GraphWaitable | None = None
+        self._direct_rcl = rcl.load()
+        self._bridge: DirectBridge | ExecutorBridge | None = None
+        try:
+            self.node = self._make_node(node, context) if isinstance(node, str) else node
+            if executor is not None:
+                executor.add_node(self.node)
+            foreign = self.node.executor
+            self._bridge = self._make_bridge(bridge, foreign)
+            if self._direct_rcl is not None and not _takes_callbacks(foreign):
+                self._waitable = GraphWaitable(self.node, self._direct_rcl, self._post_graph)
+            self.node.context.on_shutdown(self._post_shutdown)
+            if foreign is None:
+                self._spin()
+        except BaseException:
+            self.stop()
+            self.close()
+            raise
+
+    @property
+    def bridge(self) -> str:
+        """The bridge taken: ``"direct"`` or ``"executor"``."""
+        assert self._bridge is not None
+        return self._bridge.name
+
+    @property
+    def graph_events(self) -> bool:
+        """Whether changes of the graph are told."""
+        return self._waitable is not None
+
+    @property
+    def thread(self) -> int | None:
+        """Identifier of the executor thread, where this node has one."""
+        return None if self._thread is None else self._thread.ident
+
+    def ok(self) -> bool:
+        """Tell whether node and context are still up."""
+        return bool(self.node.context.ok()) and bool(self.node.handle.pointer)
+
+    def describe(self, srv_type: Any, qos: Any) -> tuple[Any, str, Hashable]:
+        """Return the service class, the type's name, and the QoS as something to compare."""
+        if qos is not None and not isinstance(qos, QoSProfile):
+            raise TypeError(f"qos must be an rclpy QoSProfile, not {type(qos).__name__}")
+        srv_class = service_type(srv_type)
+        return srv_class, type_name(srv_class), None if qos is None else repr(qos)
+
+    def request(self, srv_type: Any, request: Any) -> Any:
+        """Return a message of the request type."""
+        return request_message(srv_type, request)
+
+    def resolve(self, srv_name: str) -> str:
+        """Return the expanded and remapped name."""
+        if not isinstance(srv_name, str):
+            raise TypeError(f"a service name is a str, not {type(srv_name).__name__}")
+        try:
+            name = expand_topic_name(srv_name, self.node.get_name(), self.node.get_namespace())
+            validate_full_topic_name(name, is_service=True)
+            return str(self.node.resolve_service_name(srv_name))
+        except (
+            InvalidServiceNameException,
+            InvalidTopicNameException,
+            ValueError,
+        ) as error:
+            reason = str(error).strip().replace("\n", " ")
+            raise InvalidServiceName(f"{srv_name!r} is no service name: {reason}") from None
+
+    def open_client(self, srv_type: Any, srv_name: str, qos: Any, deliver: Deliver) -> ClientPort:
+        """Make a client whose responses go to ``deliver``."""
+        assert self._bridge is not None
+        return self._bridge.open_client(srv_type, srv_name, qos or default_qos(), deliver)
+
+    def servers(self, srv_name: str) -> int:
+        """Return how many servers of this resolved name the graph shows, whatever their type."""
+        with self.node.handle:
+            return int(self.node.handle.get_count_services(srv_name))
+
+    def provides(self, srv_type: str, srv_name: str) -> bool:
+        """Tell whether the graph shows a server of this resolved name and type."""
+        return srv_type in self._services().get(srv_name, ())
+
+    def seen_instead(self, srv_type: str, srv_name: str) -> str:
+        """Say, as a clause, what the graph shows where this service is missing."""
+        services = self._services()
+        servers = self.servers(srv_name)
+        if types := services.get(srv_name):
+            if srv_type in types:
+                return (
+                    f"{servers} server(s) of this name and type are in the graph but not matched "
+                    f"with the client: compare the QoS"
+                )
+            return f"this name is served as {', '.join(types)} ({servers} server(s))"
+        same_type = sorted(name for name, types in services.items() if srv_type in types)
+        similar = difflib.get_close_matches(srv_name, services, n=3, cutoff=0.7)
+        if names := list(dict.fromkeys([*similar, *same_type[:3]])):
+            listed = ", ".join(f"{name} ({', '.join(services[name])})" for name in names)
+            return f"no server has this name; there are {listed}"
+        return f"no server has this name, nor one like it, among {len(services)} services seen"
+
+    def on_other_thread(self, callback: Callable[..., object], *args: Any) -> None:
+        """Have a callback called on the loop's thread; from any thread.
+
+        Raises:
+            SessionClosed: the node is closed.
+        """
+        self._mailbox.post(callback, *args)
+
+    def stop(self) -> None:
+        """Ask the executor thread to end. From any thread; idempotent."""
+        self._mailbox.close()
+        if self._thread is not None:
+            self._thread.stop()
+
+    def join(self) -> bool:
+        """Wait for the executor thread to end, and tell whether it did; blocks."""
+        return self._thread is None or self._thread.join(JOIN)
+
+    async def stopped(self) -> None:
+        """Wait, after `stop`, until `join` has nothing to wait for."""
+        if self._thread is not None:
+            await self._thread_ended.wait()
+
+    def close(self) -> None:
+        """Give back what was borrowed and destroy what is owned; after `stop` and `join`."""
+        if self._waitable is not None:
+            self._waitable.close()
+        if self._bridge is not None:
+            self._bridge.close()
+        if self._own_executor is not None:
+            self._own_executor.remove_node(self.node)
+            self.node.executor = None
+            self._own_executor.shutdown()
+        if self._owned and hasattr(self, "node"):
+            self.node.destroy_node()
+        if self._own_context is not None:
+            self._own_context.try_shutdown()
+
+    def _services(self) -> dict[str, list[str]]:
+        return dict(self.node.get_service_names_and_types())
+
+    def _make_node(self, name: str, context: Context | None) -> Node:
+        if context is None:
+            context = self._own_context = Context()
+            rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
+        elif not context.ok():
+            raise UsageError("the context is not initialised, or was shut down: rclpy.init() it")
+        return Node(name, context=context)
+
+    def _make_bridge(self, bridge: str, executor: Executor | None) -> DirectBridge | ExecutorBridge:
+        tried = rclpy.get_rmw_implementation_identifier() in DIRECT_TRIED
+        takes = _takes_callbacks(executor)
+        if bridge == "direct" and (self._direct_rcl is None or takes):
+            reason = "an EventsExecutor takes the responses" if takes else "librcl is out of reach"
+            raise UsageError(f"bridge='direct' does not work here: {reason}")
+        if bridge == "executor" or self._direct_rcl is None or takes:
+            return ExecutorBridge(self.node, self._mailbox)
+        if bridge == "auto" and not tried:
+            return ExecutorBridge(self.node, self._mailbox)
+        return DirectBridge(self.node, self._direct_rcl, self._loop)
+
+    def _spin(self) -> None:
+        self._own_executor = SingleThreadedExecutor(context=self.node.context)
+        self.node.executor = self._own_executor
+        self._thread = ExecutorThread(
+            self._own_executor,
+            f"rosasync executor of {self.node.get_name()}",
+            self._post_error,
+            self._post_shutdown,
+            self._post_end,
+        )
+
+    # From the executor's thread, or whichever one shuts the context down.
+
+    def _post_graph(self) -> None:
+        if not self._graph_pending:
+            self._graph_pending = True
+            with contextlib.suppress(SessionClosed):
+                self._mailbox.post(self._tell_graph)
+
+    def _tell_graph(self) -> None:
+        self._graph_pending = False
+        self._on_graph()
+
+    def _post_shutdown(self) -> None:
+        with contextlib.suppress(SessionClosed):
+            self._mailbox.post(self._on_shutdown)
+
+    def _post_end(self) -> None:
+        with contextlib.suppress(RuntimeError):
+            self._loop.call_soon_threadsafe(self._thread_ended.set)
+
+    def _post_error(self, error: Exception) -> None:
+        context = {"message": "a callback of the node raised", "exception": error}
+        try:
+            self._mailbox.post(self._loop.call_exception_handler, context)
+        except SessionClosed:
+            logger.error("a callback of the node raised", exc_info=error)
+
+
+def default_qos() -> QoSProfile:
+    """Return the service default with a history of 1,000."""
+    qos = QoSProfile(depth=DEPTH)
+    for name in ("history", "reliability", "durability"):
+        setattr(qos, name, getattr(qos_profile_services_default, name))
+    return qos
+
+
+def _takes_callbacks(executor: Executor | None) -> bool:
+    """Tell whether this executor sets the middleware's callbacks itself (EventsExecutor)."""
+    return executor is not None and type(executor).__module__.startswith("rclpy.experimental")

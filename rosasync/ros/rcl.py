@@ -1,0 +1,77 @@
+"""The functions of librcl that rclpy does not offer, through ctypes."""
+
+from __future__ import annotations
+
+import ctypes
+import platform
+import sys
+from functools import cache
+from typing import Any
+
+__all__ = ["Rcl", "load"]
+
+
+class Rcl:
+    """librcl, and the libc function that stands in as its callback.
+
+    ``rcl_event_callback_t`` is ``void (*)(const void * user_data, size_t number_of_events)``
+    (rcl/event_callback.h). libc's ``int eventfd_write(int fd, eventfd_t value)`` fits that shape
+    where a pointer, ``size_t`` and ``eventfd_t`` are passed in the same registers and an ``int``
+    is the low half of one: on x86-64 and aarch64. So the middleware's own thread signals an
+    eventfd, with no Python and no GIL in it (a Python callback there can deadlock: rclpy issue
+    1722).
+    """
+
+    def __init__(self) -> None:
+        rcl = ctypes.CDLL("librcl.so")
+        self._signal = ctypes.cast(ctypes.CDLL(None).eventfd_write, ctypes.c_void_p)
+        pointers = [ctypes.c_void_p] * 3
+        self._on_response = rcl.rcl_client_set_on_new_response_callback
+        self._on_response.argtypes = pointers
+        self._on_request = rcl.rcl_service_set_on_new_request_callback
+        self._on_request.argtypes = pointers
+        self._graph = rcl.rcl_node_get_graph_guard_condition
+        self._graph.argtypes = [ctypes.c_void_p]
+        self._graph.restype = ctypes.c_void_p
+        self._add_guard = rcl.rcl_wait_set_add_guard_condition
+        self._add_guard.argtypes = [*pointers[:2], ctypes.POINTER(ctypes.c_size_t)]
+
+    def signal_responses(self, client: Any, fd: int | None) -> bool:
+        """Have an eventfd count the client's new responses; None ends it. False: unsupported."""
+        return _set_callback(self._on_response, client, self._signal, fd)
+
+    def signal_requests(self, service: Any, fd: int | None) -> bool:
+        """Have an eventfd count the service's new requests; None ends it. False: unsupported."""
+        return _set_callback(self._on_request, service, self._signal, fd)
+
+    def add_graph_guard(self, node: Any, wait_set: Any) -> int | None:
+        """Add the node's graph guard condition to a wait set.
+
+        Returns:
+            Its index there, None where it could not be had.
+        """
+        guard = self._graph(node.pointer)
+        index = ctypes.c_size_t()
+        if guard is None or self._add_guard(wait_set.pointer, guard, ctypes.byref(index)) != 0:
+            return None
+        return index.value
+
+
+def _set_callback(function: Any, handle: Any, signal: Any, fd: int | None) -> bool:
+    if not handle.pointer:
+        return False
+    callback, user_data = (None, None) if fd is None else (signal, ctypes.c_void_p(fd))
+    return bool(function(handle.pointer, callback, user_data) == 0)
+
+
+@cache
+def load() -> Rcl | None:
+    """Return librcl, or None where the platform has it not, or not in the shape needed."""
+    if sys.platform != "linux" or platform.machine() not in ("x86_64", "aarch64"):
+        return None
+    if sys.maxsize < 2**32:
+        return None
+    try:
+        return Rcl()
+    except (OSError, AttributeError):
+        return None

@@ -1,0 +1,469 @@
+"""Session: node, executor thread, pool and servers under one lifetime."""
+
+from __future__ import annotations
+
+import asyncio
+import atexit
+import importlib
+import logging
+import warnings
+import weakref
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Literal, Self
+
+import anyio
+
+from rosasync.errors import ContextShutdown, SessionClosed, UsageError
+from rosasync.limits import (
+    Limits,
+    Retry,
+    SessionStatistics,
+    Timeout,
+    check_timeout,
+)
+from rosasync.pool import ClientPool, Endpoint
+
+if TYPE_CHECKING:
+    from rclpy.context import Context
+    from rclpy.executors import Executor
+    from rclpy.node import Node
+
+    from rosasync.ros.node import RosNode
+
+__all__ = ["ServiceClient", "Session"]
+
+logger = logging.getLogger("rosasync")
+
+ENDING = 5.0
+"""Seconds for a callback of the node to end with the session, before its thread is left behind."""
+
+
+class Session:
+    """Calls ROS 2 services from asyncio.
+
+    ::
+
+        async with rosasync.Session("my_app") as session:
+            response = await session.call(SetBool, "/arm/enable", {"data": True}, timeout=2.0)
+
+    It belongs to the loop it is opened in, and is used on that loop's thread. It may be opened in
+    one task and closed in another.
+
+    Args:
+        node: a name, for a node and a context of the session's own, which end with it; or an
+            ``rclpy.node.Node``, which is borrowed: never destroyed, and spun only if no executor
+            has it yet. rclpy's signal handlers are not installed.
+        context: for a named node, the ``rclpy.context.Context`` to make it in; not shut down.
+        executor: an ``rclpy.executors.Executor`` that you spin: the node is added to it, and the
+            session starts no thread.
+        bridge: how responses reach the loop: ``"direct"``, ``"executor"``, or ``"auto"`` for the
+            direct one where it works.
+        limits: what the pool may use for each service.
+        timeout: seconds for a call that does not say, None for no deadline.
+
+    Raises:
+        TypeError, ValueError: an argument is of the wrong kind, or out of range.
+    """
+
+    def __init__(
+        self,
+        node: str | Node = "rosasync",
+        *,
+        context: Context | None = None,
+        executor: Executor | None = None,
+        bridge: Literal["auto", "direct", "executor"] = "auto",
+        limits: Limits | None = None,
+        timeout: float | None = 10.0,
+    ) -> None:
+        if bridge not in ("auto", "direct", "executor"):
+            raise ValueError(f"bridge must be 'auto', 'direct' or 'executor', not {bridge!r}")
+        if limits is not None and not isinstance(limits, Limits):
+            raise TypeError(f"limits must be a rosasync.Limits, not {type(limits).__name__}")
+        self._name = node
+        self._context = context
+        self._executor = executor
+        self._wanted_bridge = bridge
+        self._limits = Limits() if limits is None else limits
+        self._timeout = check_timeout(timeout, None)
+        self._core: _Core | None = None
+        self._closed = False
+
+    def __repr__(self) -> str:
+        if self._core is None:
+            return f"<Session {self._name!r} not open>"
+        state = "closed" if self._closed else f"{self.bridge} bridge, {self._core.pool!r}"
+        return f"<Session {self._core.ros.node.get_name()!r} {state}>"
+
+    async def __aenter__(self) -> Self:
+        """Open the session in the running loop.
+
+        Raises:
+            ImportError: rclpy is not installed; the message says how to install it.
+            UsageError: it was opened before, or the bridge asked for does not work here.
+            TypeError: ``node`` is neither a name nor an rclpy node.
+        """
+        if self._core is not None or self._closed:
+            raise UsageError("a session is opened once")
+        ros_node = _import_ros("rosasync.ros.node").RosNode
+        if not isinstance(self._name, str) and not hasattr(self._name, "create_client"):
+            kind = type(self._name).__name__
+            raise TypeError(f"node must be a name or an rclpy.node.Node, not {kind}")
+        self._core = _Core(self, ros_node)
+        return self
+
+    async def __aexit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        await self.aclose()
+
+    def __del__(self) -> None:
+        core = getattr(self, "_core", None)
+        if core is not None and not self._closed:
+            _warn_unclosed(self)
+            core.abandon()
+
+    @property
+    def closed(self) -> bool:
+        """Whether the session has been closed, or its closing has begun."""
+        return self._closed
+
+    @property
+    def bridge(self) -> str:
+        """The bridge in use: ``"direct"`` or ``"executor"``."""
+        return self._open_core().ros.bridge
+
+    @property
+    def node(self) -> Node:
+        """The rclpy node: for its timers, publishers, parameters and so on."""
+        return self._open_core().ros.node
+
+    @property
+    def pool(self) -> ClientPool:
+        """The clients."""
+        return self._open_core().pool
+
+    def statistics(self) -> SessionStatistics:
+        """Take a snapshot of how the session stands; after the close, of how it ended."""
+        core = self._open_core()
+        return SessionStatistics(bridge=core.ros.bridge, pool=core.pool.statistics())
+
+    async def call(
+        self,
+        srv_type: Any,
+        srv_name: str,
+        request: Any = None,
+        *,
+        timeout: Timeout = ...,
+        qos: Any = None,
+        wait: bool = True,
+        retry: Retry | None = None,
+    ) -> Any:
+        """Call a service and return its response.
+
+        Args:
+            srv_type: a service class or its name, ``"std_srvs/srv/SetBool"``.
+            srv_name: the service's name; relative, private (``~/name``) and remapped names work
+                as in rclpy.
+            request: a message of the request type, a mapping of its fields, or None for an empty
+                one.
+            timeout: seconds for the whole call, None for no deadline; the session's where it is
+                left out.
+            qos: a ``QoSProfile``; None for the service default with a history of 1,000.
+            wait: False to fail at once where no server is there.
+            retry: when to send again what is unanswered; only for services that may run twice.
+                The request is sent as it then is: it must not be changed before the answer.
+
+        Raises:
+            ServiceUnavailable: no server was there in time.
+            QueueTimeout: the deadline passed while waiting for a client; nothing was sent.
+            ResponseTimeout: sent, and not answered in time.
+            ServerGone: the last server vanished while the request was out.
+            PoolFull: as many callers as ``Limits.waiting`` allows are waiting already.
+            SessionClosed, ContextShutdown: the session ended, before or during the call.
+            InvalidServiceName: ROS does not allow the name.
+            TypeError, ValueError: type, request or timeout do not fit; nothing was sent.
+            UsageError: called from another loop or thread.
+        """
+        pool = self._use().pool
+        endpoint = pool.endpoint(srv_type, srv_name, qos)
+        message = pool.request(endpoint, request)
+        seconds = self._timeout if timeout is ... else check_timeout(timeout, None)
+        return await pool.call(endpoint, message, seconds, wait, retry)
+
+    def start(
+        self,
+        srv_type: Any,
+        srv_name: str,
+        request: Any = None,
+        *,
+        timeout: Timeout = ...,
+        qos: Any = None,
+        wait: bool = True,
+        retry: Retry | None = None,
+    ) -> asyncio.Task[Any]:
+        """Start the same call as a task: what a tick polls and cancels.
+
+        For the arguments and errors, see `call`. What is wrong with the arguments is raised here,
+        what goes wrong later by the task.
+        """
+        pool = self._use().pool
+        endpoint = pool.endpoint(srv_type, srv_name, qos)
+        message = pool.request(endpoint, request)
+        seconds = check_timeout(timeout, self._timeout)
+        return self._loop.create_task(pool.call(endpoint, message, seconds, wait, retry))
+
+    def client(
+        self, srv_type: Any, srv_name: str, *, timeout: Timeout = ..., qos: Any = None
+    ) -> ServiceClient:
+        """Bind type and name, for several calls. The handle owns nothing: the pool does.
+
+        Raises:
+            InvalidServiceName: ROS does not allow the name.
+            TypeError, ValueError: type, QoS or timeout do not fit.
+            SessionClosed: the session is closed.
+        """
+        endpoint = self._use().pool.endpoint(srv_type, srv_name, qos)
+        return ServiceClient(self, endpoint, check_timeout(timeout, self._timeout))
+
+    async def wait_for_service(
+        self, srv_type: Any, srv_name: str, *, timeout: float | None = None, qos: Any = None
+    ) -> None:
+        """Wait until a server of this service is matched.
+
+        Args:
+            srv_type: a service class or its name.
+            srv_name: the service's name.
+            timeout: seconds, None for no deadline.
+            qos: as for `call`.
+
+        Raises:
+            ServiceUnavailable: none was there in time; the message says what was seen instead.
+            SessionClosed, ContextShutdown: the session ended meanwhile.
+        """
+        pool = self._use().pool
+        endpoint = pool.endpoint(srv_type, srv_name, qos)
+        await pool.wait_for_server(endpoint, check_timeout(timeout, None))
+
+    def service_is_ready(self, srv_type: Any, srv_name: str, *, qos: Any = None) -> bool:
+        """Tell whether a server of this service is matched, so that a call would be sent at once.
+
+        A service asked for the first time needs some milliseconds to be matched.
+        """
+        pool = self._use().pool
+        return pool.is_ready(pool.endpoint(srv_type, srv_name, qos))
+
+    async def aclose(self) -> None:
+        """End the session and everything it started; idempotent.
+
+        Calls under way end with `SessionClosed`. It is not cut short by cancellation.
+        """
+        if self._core is None:
+            self._closed = True
+            return
+        self._core.check_loop()
+        self._closed = True
+        await self._core.aclose()
+
+    def _open_core(self) -> _Core:
+        if self._core is None:
+            raise UsageError("the session is not open: use `async with rosasync.Session(…)`")
+        return self._core
+
+    def _use(self) -> _Core:
+        core = self._core
+        if core is None:
+            raise (
+                SessionClosed("the session is closed")
+                if self._closed
+                else UsageError("the session is not open: use `async with rosasync.Session(…)`")
+            )
+        core.check_loop()
+        return core
+
+    @property
+    def _loop(self) -> asyncio.AbstractEventLoop:
+        return self._open_core().loop
+
+
+class ServiceClient:
+    """A service type and name bound to a session; see `Session.client`."""
+
+    __slots__ = ("_endpoint", "_session", "_timeout")
+
+    def __init__(self, session: Session, endpoint: Endpoint, timeout: float | None) -> None:
+        self._session = session
+        self._endpoint = endpoint
+        self._timeout = timeout
+
+    def __repr__(self) -> str:
+        return f"<ServiceClient {self.srv_name} [{self.srv_type}]>"
+
+    @property
+    def srv_name(self) -> str:
+        """The resolved service name."""
+        return self._endpoint.key.srv_name
+
+    @property
+    def srv_type(self) -> str:
+        """The service type's name."""
+        return self._endpoint.key.srv_type
+
+    @property
+    def ready(self) -> bool:
+        """Whether a server is matched, so that a call would be sent at once."""
+        return self._session._use().pool.is_ready(self._endpoint)
+
+    async def call(
+        self,
+        request: Any = None,
+        *,
+        timeout: Timeout = ...,
+        wait: bool = True,
+        retry: Retry | None = None,
+    ) -> Any:
+        """Call the service; see `Session.call`."""
+        pool = self._session._use().pool
+        message = pool.request(self._endpoint, request)
+        seconds = self._timeout if timeout is ... else check_timeout(timeout, None)
+        return await pool.call(self._endpoint, message, seconds, wait, retry)
+
+    def start(
+        self,
+        request: Any = None,
+        *,
+        timeout: Timeout = ...,
+        wait: bool = True,
+        retry: Retry | None = None,
+    ) -> asyncio.Task[Any]:
+        """Start the same call as a task; see `Session.start`."""
+        core = self._session._use()
+        message = core.pool.request(self._endpoint, request)
+        seconds = check_timeout(timeout, self._timeout)
+        return core.loop.create_task(core.pool.call(self._endpoint, message, seconds, wait, retry))
+
+    async def wait(self, timeout: float | None = None) -> None:
+        """Wait until a server is matched; see `Session.wait_for_service`."""
+        pool = self._session._use().pool
+        await pool.wait_for_server(self._endpoint, check_timeout(timeout, None))
+
+
+class _Core:
+    """What an open session consists of, without a way back to it.
+
+    So a session that is dropped unclosed can be collected, say so, and end its thread.
+    """
+
+    def __init__(self, session: Session, ros_node: type[RosNode]) -> None:
+        self.loop = asyncio.get_running_loop()
+        self.ros = ros_node(
+            session._name,
+            session._context,
+            session._executor,
+            session._wanted_bridge,
+            self._graph_changed,
+            self._context_shut_down,
+        )
+        self.pool = ClientPool(self.ros, session._limits, session._timeout)
+        self._ended: asyncio.Task[None] | None = None
+        self._session = weakref.ref(session)
+        atexit.register(self._exit)
+
+    def check_loop(self) -> None:
+        """Raise `UsageError` on any other loop or thread than the session's."""
+        if asyncio._get_running_loop() is not self.loop:
+            raise UsageError(
+                "a session is used in the loop that opened it; from other threads there is "
+                "session.from_thread"
+            )
+
+    async def aclose(self) -> None:
+        """End everything, once; whoever else closes waits for the same end."""
+        if self._ended is None:
+            self._ended = self.loop.create_task(self._end())
+        cancelled = None
+        with anyio.CancelScope(shield=True):
+            while not self._ended.done():
+                try:
+                    await asyncio.wait({self._ended})
+                except asyncio.CancelledError as error:
+                    cancelled = error
+        if cancelled is not None:
+            raise cancelled
+        self._ended.result()
+
+    def abandon(self) -> None:
+        """End a session that nobody closed. Called by the garbage collector, on any thread."""
+        atexit.unregister(self._exit)
+        self.ros.stop()
+        if self.loop.is_closed():
+            self._give_up()
+        else:
+            self.loop.call_soon_threadsafe(self._abandon)
+
+    def _abandon(self) -> None:
+        self.pool.end(_session_closed)
+        self._give_up()
+
+    def _give_up(self) -> None:
+        if self.ros.join():
+            self.ros.close()
+
+    def _exit(self) -> None:
+        """End the thread at the interpreter's exit; see ExecutorThread."""
+        session = self._session()
+        if session is not None and not session.closed:
+            session._closed = True
+            _warn_unclosed(session)
+        self.ros.stop()
+        self.ros.join()
+
+    async def _end(self) -> None:
+        atexit.unregister(self._exit)
+        self.pool.end(_session_closed)
+        self.ros.stop()
+        with anyio.move_on_after(ENDING, shield=True):
+            await self.ros.stopped()
+            self.ros.join()
+            self.ros.close()
+            return
+        logger.warning(
+            "a callback of node %s is still running: its executor thread is left behind",
+            self.ros.node.get_name(),
+        )
+
+    def _graph_changed(self) -> None:
+        self.pool.graph_changed()
+
+    def _context_shut_down(self) -> None:
+        self.pool.end(_context_shut_down)
+
+
+def _warn_unclosed(session: Session) -> None:
+    warnings.warn(f"unclosed {session!r}", ResourceWarning, source=session, stacklevel=2)
+
+
+def _session_closed() -> Exception:
+    return SessionClosed("the session is closed")
+
+
+def _context_shut_down() -> Exception:
+    return ContextShutdown("the rclpy context was shut down")
+
+
+def _import_ros(module: str) -> Any:
+    """Import a module that needs rclpy.
+
+    Raises:
+        ImportError: rclpy is not there; the message says how to get it.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise ImportError(
+            f"rosasync needs rclpy, which does not import here ({error}). Without a ROS "
+            "installation: pip install 'rosasync[jazzy]' (or [kilted]). With one: source its "
+            "setup file, /opt/ros/<distribution>/setup.bash, and use its Python"
+        ) from error
