@@ -182,7 +182,7 @@ class Client:
         if still_queued:
             self._abandon(sequence_number)
         else:
-            self._port.forget(sequence_number)
+            self._loop.call_later(self.grace, self._port.forget, sequence_number)
 
     def _abandon(self, sequence_number: int) -> None:
         if self.closed:

@@ -1,0 +1,410 @@
+"""A ROS graph in memory, with faults on demand, and pytest fixtures: tests without a middleware.
+
+::
+
+    async def test_enables_the_arm():
+        graph = FakeGraph()
+        graph.serve(SetBool, "/arm/enable", lambda request: SetBool.Response(success=True))
+        async with graph.session() as session:
+            with graph.delay_responses(0.1):
+                assert (await session.call(SetBool, "/arm/enable", {"data": True})).success
+
+As a pytest plugin (``pytest_plugins = ["rosasync.testing"]``) it brings the fixtures ``fake_graph``
+and ``ros_domain``.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+from collections import deque
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import contextmanager
+from copy import deepcopy
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+
+from rosasync.errors import InvalidServiceName
+from rosasync.ros.domain import isolate
+from rosasync.ros.messages import request_message, service_type, type_name
+from rosasync.ros.ports import Deliver, DeliverRequest, Undeliverable
+from rosasync.session import Session
+
+__all__ = [
+    "FakeClient",
+    "FakeGraph",
+    "FakeNode",
+    "FakeServer",
+    "FakeService",
+    "fake_graph",
+    "ros_domain",
+]
+
+
+@dataclass
+class FakeServer:
+    """A server in a `FakeGraph`.
+
+    Attributes:
+        depth: how many requests its queue holds while responses are held back; what comes then
+            is lost without a word, as in the middleware.
+        received: the requests handled, in order.
+        lost: how many requests were lost.
+    """
+
+    graph: FakeGraph
+    srv_type: Any
+    srv_name: str
+    handler: Callable[[Any], Any]
+    depth: int = 10
+    received: list[Any] = field(default_factory=list)
+    lost: int = 0
+    _queue: deque[tuple[FakeClient, int, Any]] = field(default_factory=deque)
+
+    def close(self) -> None:
+        """Vanish from the graph, with every request that is queued; idempotent."""
+        self._queue.clear()
+        if self in self.graph.servers:
+            self.graph.servers.remove(self)
+            self.graph.changed()
+
+    def _take(self, client: FakeClient, number: int, request: Any) -> None:
+        if self.graph.holding and len(self._queue) >= self.depth:
+            self.lost += 1
+            return
+        self._queue.append((client, number, request))
+        if not self.graph.holding:
+            self._work()
+
+    def _work(self) -> None:
+        while self._queue:
+            client, number, request = self._queue.popleft()
+            self.received.append(request)
+            response = self.handler(request)
+            if not self.graph.dropping_responses:
+                client.later(self.graph.delay, number, response)
+
+
+@dataclass(frozen=True)
+class FakeHeader:
+    """The header of a fake request: a `rosasync.ros.ports.RequestHeader`, and its own id."""
+
+    client: FakeClient
+    sequence_number: int
+    source_timestamp: int = 0
+    received_timestamp: int = 0
+
+    @property
+    def request_id(self) -> FakeHeader:
+        """Where the response goes."""
+        return self
+
+
+class FakeService(FakeServer):
+    """A service that a session serves in a `FakeGraph`: a `rosasync.ros.ports.ServicePort`.
+
+    Attributes:
+        sent: the responses sent, in order, as they then were.
+    """
+
+    handle = None
+    qos = None
+
+    def __init__(
+        self, graph: FakeGraph, srv_type: Any, srv_name: str, deliver: DeliverRequest
+    ) -> None:
+        super().__init__(graph, srv_type, srv_name, lambda request: None, depth=1000)
+        self.sent: list[Any] = []
+        self._deliver = deliver
+        self._stopped = False
+        self._loop = asyncio.get_running_loop()
+
+    def send(self, header: Any, response: Any) -> None:
+        """Send a copy of a response; any thread.
+
+        Raises:
+            Undeliverable: its client is closed.
+        """
+        if header.client.closed:
+            raise Undeliverable("the client is gone")
+        copy = deepcopy(response)
+        self.sent.append(copy)
+        if not self.graph.dropping_responses:
+            self._loop.call_soon_threadsafe(
+                header.client.later, self.graph.delay, header.sequence_number, copy
+            )
+
+    def has_clients(self) -> bool:
+        """Tell whether there is a client of this name."""
+        return any(
+            client.srv_name == self.srv_name for node in self.graph.nodes for client in node.clients
+        )
+
+    def stop(self) -> None:
+        """Deliver no more requests; idempotent."""
+        self._stopped = True
+
+    def _work(self) -> None:
+        while self._queue:
+            client, number, request = self._queue.popleft()
+            self.received.append(request)
+            self._loop.call_soon(self._arrived, request, FakeHeader(client, number))
+
+    def _arrived(self, request: Any, header: FakeHeader) -> None:
+        if not self._stopped:
+            self._deliver(request, header)
+
+
+class FakeGraph:
+    """Servers in memory, the nodes that see them, and what goes wrong between them.
+
+    Confined to one loop's thread.
+    """
+
+    def __init__(self, *, graph_events: bool = True) -> None:
+        self.graph_events = graph_events
+        self.servers: list[FakeServer] = []
+        self.nodes: list[FakeNode] = []
+        self.delay = 0.0
+        self.holding = False
+        self.dropping_requests = False
+        self.dropping_responses = False
+
+    def serve(
+        self, srv_type: Any, srv_name: str, handler: Callable[[Any], Any], *, depth: int = 10
+    ) -> FakeServer:
+        """Put a server into the graph; ``handler(request)`` returns the response."""
+        server = FakeServer(self, service_type(srv_type), srv_name, handler, depth)
+        self.servers.append(server)
+        self.changed()
+        return server
+
+    def session(self, **options: Any) -> Session:
+        """Make a session in this graph; options as for `rosasync.Session`."""
+        return Session(FakeNode(self), **options)
+
+    def changed(self) -> None:
+        """Tell every node that the graph has changed."""
+        if self.graph_events:
+            for node in tuple(self.nodes):
+                node.on_graph()
+
+    @contextmanager
+    def delay_responses(self, seconds: float) -> Iterator[None]:
+        """Deliver the responses of requests sent meanwhile so much later."""
+        before, self.delay = self.delay, seconds
+        try:
+            yield
+        finally:
+            self.delay = before
+
+    @contextmanager
+    def drop_requests(self) -> Iterator[None]:
+        """Lose every request sent meanwhile."""
+        self.dropping_requests = True
+        try:
+            yield
+        finally:
+            self.dropping_requests = False
+
+    @contextmanager
+    def drop_responses(self) -> Iterator[None]:
+        """Lose the response of every request handled meanwhile."""
+        self.dropping_responses = True
+        try:
+            yield
+        finally:
+            self.dropping_responses = False
+
+    @contextmanager
+    def hold_requests(self) -> Iterator[None]:
+        """Have the servers handle nothing meanwhile, and everything they could queue afterwards."""
+        self.holding = True
+        try:
+            yield
+        finally:
+            self.holding = False
+            for server in tuple(self.servers):
+                server._work()
+
+    def find(self, srv_type: str, srv_name: str) -> list[FakeServer]:
+        """Return the servers of this type's name and this name."""
+        return [
+            server
+            for server in self.servers
+            if server.srv_name == srv_name and type_name(server.srv_type) == srv_type
+        ]
+
+
+class FakeNode:
+    """A node of a `FakeGraph`: a `rosasync.ros.ports.NodePort`, and all a session asks for."""
+
+    bridge = "fake"
+    thread: int | None = None
+
+    def __init__(self, graph: FakeGraph) -> None:
+        self.graph = graph
+        self.node = self
+        self.up = True
+        self.clients: list[FakeClient] = []
+        self.on_graph: Callable[[], None] = lambda: None
+        self.on_shutdown: Callable[[], None] = lambda: None
+
+    def attach(self, on_graph: Callable[[], None], on_shutdown: Callable[[], None]) -> FakeNode:
+        """Join the graph; called by the session, in its loop."""
+        self._loop = asyncio.get_running_loop()
+        self.on_graph = on_graph
+        self.on_shutdown = on_shutdown
+        self.graph.nodes.append(self)
+        return self
+
+    def shutdown(self) -> None:
+        """Have the context go down under the session."""
+        self.up = False
+        self.on_shutdown()
+
+    @property
+    def graph_events(self) -> bool:
+        """Whether changes of the graph are told."""
+        return self.graph.graph_events
+
+    def ok(self) -> bool:
+        """Tell whether the context is up."""
+        return self.up
+
+    def get_name(self) -> str:
+        """Return the node's name."""
+        return "fake"
+
+    def describe(self, srv_type: Any, qos: Any) -> tuple[Any, str, Hashable]:
+        """Return the service class, the type's name, and the QoS."""
+        srv_class = service_type(srv_type)
+        return srv_class, type_name(srv_class), qos
+
+    def request(self, srv_type: Any, request: Any) -> Any:
+        """Return a message of the request type."""
+        return request_message(srv_type, request)
+
+    def resolve(self, srv_name: str) -> str:
+        """Return the name with a leading slash."""
+        name = srv_name if srv_name.startswith("/") else f"/{srv_name}"
+        if not all(part.isidentifier() for part in name[1:].split("/")):
+            raise InvalidServiceName(f"{srv_name!r} is no service name")
+        return name
+
+    def open_client(self, srv_type: Any, srv_name: str, qos: Any, deliver: Deliver) -> FakeClient:
+        """Make a client whose responses go to ``deliver``."""
+        client = FakeClient(self, type_name(srv_type), self.resolve(srv_name), deliver)
+        self.clients.append(client)
+        return client
+
+    def open_service(
+        self, srv_type: Any, srv_name: str, qos: Any, deliver: DeliverRequest
+    ) -> FakeService:
+        """Make a service whose requests go to ``deliver``."""
+        service = FakeService(self.graph, srv_type, self.resolve(srv_name), deliver)
+        self.graph.servers.append(service)
+        self.graph.changed()
+        return service
+
+    def servers(self, srv_name: str) -> int:
+        """Return how many servers have this name."""
+        return sum(server.srv_name == srv_name for server in self.graph.servers)
+
+    def provides(self, srv_type: str, srv_name: str) -> bool:
+        """Tell whether there is a server of this name and type."""
+        return bool(self.graph.find(srv_type, srv_name))
+
+    def seen_instead(self, srv_type: str, srv_name: str) -> str:
+        """Say what the graph holds."""
+        return f"the graph has {sorted(server.srv_name for server in self.graph.servers)}"
+
+    def on_other_thread(self, callback: Callable[..., object], *args: Any) -> None:
+        """Have a callback called on the loop's thread."""
+        self._loop.call_soon_threadsafe(callback, *args)
+
+    def stop(self) -> None:
+        """There is no thread."""
+
+    def join(self) -> bool:
+        """There is no thread."""
+        return True
+
+    async def stopped(self) -> None:
+        """There is no thread."""
+
+    def close(self) -> None:
+        """Leave the graph; idempotent."""
+        if self in self.graph.nodes:
+            self.graph.nodes.remove(self)
+
+
+class FakeClient:
+    """A client of a `FakeNode`: a `rosasync.ros.ports.ClientPort`.
+
+    Attributes:
+        sent: the numbers of the requests sent, in order.
+        out: those whose response is still expected.
+        most: how many were out at once at the most.
+    """
+
+    def __init__(self, node: FakeNode, srv_type: str, srv_name: str, deliver: Deliver) -> None:
+        self.node = node
+        self.srv_type = srv_type
+        self.srv_name = srv_name
+        self.closed = False
+        self.sent: list[int] = []
+        self.out: set[int] = set()
+        self.most = 0
+        self._deliver = deliver
+        self._numbers = itertools.count(1)
+
+    def send(self, request: Any) -> int:
+        """Send a request to every server of the name."""
+        number = next(self._numbers)
+        self.sent.append(number)
+        self.out.add(number)
+        self.most = max(self.most, len(self.out))
+        if not self.node.graph.dropping_requests:
+            for server in self.node.graph.find(self.srv_type, self.srv_name):
+                server._take(self, number, request)
+        return number
+
+    def later(self, delay: float, number: int, response: Any) -> None:
+        """Deliver a response, ``delay`` seconds from now but never at once."""
+        loop = asyncio.get_running_loop()
+        loop.call_later(delay, self.deliver, number, response)
+
+    def deliver(self, number: int, response: Any) -> None:
+        """Deliver a response, now."""
+        self.out.discard(number)
+        if not self.closed:
+            self._deliver(number, response)
+
+    def forget(self, sequence_number: int) -> None:
+        """Expect no response to this request any more."""
+        self.out.discard(sequence_number)
+
+    def ready(self) -> bool:
+        """Tell whether there is a server."""
+        return self.node.provides(self.srv_type, self.srv_name)
+
+    def close(self) -> None:
+        """Leave the node; idempotent."""
+        if not self.closed:
+            self.closed = True
+            self.node.clients.remove(self)
+
+
+@pytest.fixture
+def fake_graph() -> FakeGraph:
+    """An empty graph in memory."""
+    return FakeGraph()
+
+
+@pytest.fixture(scope="session")
+def ros_domain() -> int:
+    """A ROS domain of the test run's own; see `rosasync.ros.domain.isolate`."""
+    return isolate()

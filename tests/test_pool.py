@@ -1,0 +1,527 @@
+"""The pool on fake ports: who gets a client, in which order, and what is left behind."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import random
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
+from typing import Any
+
+import pytest
+
+from rosasync import (
+    ContextShutdown,
+    Limits,
+    PoolFull,
+    QueueTimeout,
+    ResponseTimeout,
+    Retry,
+    ServerGone,
+    ServiceUnavailable,
+    Session,
+    SessionClosed,
+    UsageError,
+)
+from rosasync.testing import FakeClient, FakeGraph, FakeNode
+from tests.support.times import TICK, until
+
+
+class Echo:
+    """A service of plain Python."""
+
+    class Request:
+        def __init__(self, value: object = None) -> None:
+            self.value = value
+
+    class Response:
+        def __init__(self, value: object = None) -> None:
+            self.value = value
+
+
+def echo(request: Echo.Request) -> Echo.Response:
+    return Echo.Response(request.value)
+
+
+@asynccontextmanager
+async def opened(
+    graph: FakeGraph, limits: Limits | None = None, **options: Any
+) -> AsyncIterator[Session]:
+    async with graph.session(limits=limits, **options) as session:
+        yield session
+
+
+async def ask(session: Session, value: object, **options: Any) -> object:
+    response = await session.call(Echo, "/echo", Echo.Request(value), **options)
+    return response.value
+
+
+def clients(graph: FakeGraph) -> list[FakeClient]:
+    return [client for node in graph.nodes for client in node.clients]
+
+
+async def test_each_caller_gets_the_answer_to_its_own_request(fake_graph: FakeGraph) -> None:
+    fake_graph.serve(Echo, "/echo", echo)
+    async with opened(fake_graph) as session:
+        assert await asyncio.gather(*(ask(session, i) for i in range(100))) == list(range(100))
+        total = session.pool.statistics()
+    assert (total.completed, total.in_flight, total.waiting, total.peak) == (100, 0, 0, 10)
+
+
+async def test_one_client_carries_ten(fake_graph: FakeGraph) -> None:
+    server = fake_graph.serve(Echo, "/echo", echo)
+    async with opened(fake_graph) as session:
+        with fake_graph.hold_requests():
+            tasks = [asyncio.create_task(ask(session, i)) for i in range(30)]
+            await until(lambda: session.pool.statistics().in_flight == 10)
+            assert session.pool.statistics().waiting == 20
+        await asyncio.gather(*tasks)
+        assert [client.most for client in clients(fake_graph)] == [10]
+    assert server.lost == 0
+
+
+async def test_exclusive_clients_grow_on_demand_and_none_carries_two(
+    fake_graph: FakeGraph,
+) -> None:
+    fake_graph.serve(Echo, "/echo", echo)
+    async with opened(fake_graph, Limits(clients=8, in_flight=1)) as session:
+        await ask(session, 0)
+        assert session.pool.statistics().clients == 1
+        with fake_graph.hold_requests():
+            tasks = [asyncio.create_task(ask(session, i)) for i in range(9)]
+            await until(lambda: session.pool.statistics().in_flight == 8)
+            assert session.pool.statistics().waiting == 1
+        await asyncio.gather(*tasks)
+        assert [client.most for client in clients(fake_graph)] == [1] * 8
+        sent = [len(client.sent) for client in clients(fake_graph)]
+        await asyncio.gather(*(ask(session, i) for i in range(8)))
+        again = [len(client.sent) for client in clients(fake_graph)]
+        assert [b - a for a, b in zip(sent, again, strict=True)] == [1] * 8
+        assert session.pool.statistics().created == 8
+
+
+async def test_first_come_first_served_also_when_waiters_leave(fake_graph: FakeGraph) -> None:
+    server = fake_graph.serve(Echo, "/echo", echo)
+    async with opened(fake_graph, Limits(in_flight=1)) as session:
+        with fake_graph.hold_requests():
+            tasks = [asyncio.create_task(ask(session, i)) for i in range(10)]
+            await until(lambda: session.pool.statistics().waiting == 9)
+            for gone in (3, 4, 8):
+                tasks[gone].cancel()
+            await asyncio.gather(*(tasks[gone] for gone in (3, 4, 8)), return_exceptions=True)
+        await asyncio.gather(*tasks, return_exceptions=True)
+        assert [r.value for r in server.received] == [0, 1, 2, 5, 6, 7, 9]
+        total = session.pool.statistics()
+    assert (total.cancelled, total.completed, total.waiting) == (3, 7, 0)
+
+
+async def test_a_place_granted_to_one_who_is_cancelled_goes_to_the_next(
+    fake_graph: FakeGraph,
+) -> None:
+    fake_graph.serve(Echo, "/echo", echo)
+    async with opened(fake_graph, Limits(in_flight=1)) as session:
+        async with session.pool.lease(Echo, "/echo"):
+            first = asyncio.create_task(ask(session, 1))
+            second = asyncio.create_task(ask(session, 2))
+            await until(lambda: session.pool.statistics().waiting == 2)
+        # The lease has just been granted to the first, whose task does not know it yet.
+        first.cancel()
+        assert await second == 2
+        with pytest.raises(asyncio.CancelledError):
+            await first
+        assert session.pool.statistics().idle == 1
+
+
+async def test_an_abandoned_request_holds_its_place_until_its_late_response(
+    fake_graph: FakeGraph,
+) -> None:
+    fake_graph.serve(Echo, "/echo", echo)
+    async with opened(fake_graph, Limits(in_flight=1, grace=1000.0)) as session:
+        with fake_graph.hold_requests():
+            with pytest.raises(ResponseTimeout):
+                await ask(session, 1, timeout=TICK)
+            total = session.pool.statistics()
+            assert (total.abandoned, total.in_flight, total.timed_out) == (1, 0, 1)
+            waiting = asyncio.create_task(ask(session, 2))
+            with pytest.raises(QueueTimeout, match="1 abandoned"):
+                await ask(session, 3, timeout=TICK)
+        assert await waiting == 2
+        total = session.pool.statistics()
+    assert (total.abandoned, total.late, total.completed) == (0, 1, 1)
+
+
+async def test_an_abandoned_request_gives_its_place_back_after_the_grace(
+    fake_graph: FakeGraph,
+) -> None:
+    fake_graph.serve(Echo, "/echo", echo)
+    async with opened(fake_graph, Limits(in_flight=1, grace=2 * TICK)) as session:
+        with fake_graph.drop_requests(), pytest.raises(ResponseTimeout):
+            await ask(session, 1, timeout=TICK)
+        assert session.pool.statistics().abandoned == 1
+        assert await ask(session, 2) == 2
+        assert session.pool.statistics().abandoned == 0
+
+
+async def test_a_response_between_cancel_and_wake_up_harms_nobody(fake_graph: FakeGraph) -> None:
+    fake_graph.serve(Echo, "/echo", echo)
+    async with opened(fake_graph) as session:
+        await ask(session, 0)
+        with fake_graph.drop_requests():
+            task = asyncio.create_task(ask(session, 1))
+            await until(lambda: session.pool.statistics().in_flight == 1)
+        client = clients(fake_graph)[0]
+        task.cancel()
+        client.deliver(client.sent[-1], Echo.Response("late"))
+        with pytest.raises(asyncio.CancelledError):
+            await task
+        assert await ask(session, 2) == 2
+        total = session.pool.statistics()
+    assert (total.late, total.abandoned, total.idle) == (1, 0, 1)
+
+
+async def test_a_cancel_after_the_response_loses_only_that_call(fake_graph: FakeGraph) -> None:
+    fake_graph.serve(Echo, "/echo", echo)
+    async with opened(fake_graph) as session:
+        await ask(session, 0)
+        with fake_graph.drop_requests():
+            task = asyncio.create_task(ask(session, 1))
+            await until(lambda: session.pool.statistics().in_flight == 1)
+        client = clients(fake_graph)[0]
+        client.deliver(client.sent[-1], Echo.Response("in time"))
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+        total = session.pool.statistics()
+    assert (total.late, total.abandoned, total.in_flight, total.cancelled) == (0, 0, 0, 1)
+
+
+async def test_a_call_goes_out_as_soon_as_its_server_appears(fake_graph: FakeGraph) -> None:
+    async with opened(fake_graph) as session:
+        tasks = [asyncio.create_task(ask(session, i)) for i in range(3)]
+        await until(lambda: session.pool.statistics().waiting == 3)
+        fake_graph.serve(Echo, "/echo", echo)
+        assert await asyncio.gather(*tasks) == [0, 1, 2]
+
+
+@pytest.mark.parametrize("events", [True, False])
+async def test_the_poller_serves_where_graph_events_do_not(events: bool) -> None:
+    graph = FakeGraph(graph_events=events)
+    async with opened(graph) as session:
+        waiting = asyncio.create_task(session.wait_for_service(Echo, "/echo"))
+        await asyncio.sleep(0)
+        server = graph.serve(Echo, "/echo", echo)
+        await waiting
+        with graph.drop_requests():
+            task = asyncio.create_task(ask(session, 1))
+            await until(lambda: session.pool.statistics().in_flight == 1)
+            server.close()
+            with pytest.raises(ServerGone):
+                await task
+
+
+async def test_unavailable_says_what_was_seen(fake_graph: FakeGraph) -> None:
+    fake_graph.serve(Echo, "/echoes", echo)
+    async with opened(fake_graph) as session:
+        with pytest.raises(ServiceUnavailable, match=r"/echo: .*\['/echoes'\]") as caught:
+            await ask(session, 1, timeout=TICK)
+        assert caught.value.srv_name == "/echo"
+        assert caught.value.elapsed >= TICK * 0.9
+        with pytest.raises(ServiceUnavailable):
+            await ask(session, 1, wait=False, timeout=None)
+        assert clients(fake_graph)[0].sent == []
+
+
+async def test_server_gone_spares_a_response_sent_before(fake_graph: FakeGraph) -> None:
+    server = fake_graph.serve(Echo, "/echo", echo)
+    async with opened(fake_graph) as session:
+        await ask(session, 0)
+        with fake_graph.delay_responses(TICK / 10):
+            task = asyncio.create_task(ask(session, 1))
+            await until(lambda: len(server.received) == 2)
+        server.close()
+        assert await task == 1
+
+
+async def test_after_its_server_is_gone_a_call_waits_for_the_next(fake_graph: FakeGraph) -> None:
+    server = fake_graph.serve(Echo, "/echo", echo)
+    async with opened(fake_graph) as session:
+        with fake_graph.hold_requests():
+            task = asyncio.create_task(ask(session, 1))
+            abandoned = asyncio.create_task(ask(session, 2))
+            await until(lambda: session.pool.statistics().in_flight == 2)
+            abandoned.cancel()
+            server.close()
+            with pytest.raises(ServerGone):
+                await task
+        assert session.pool.statistics().abandoned == 0
+        later = asyncio.create_task(ask(session, 3))
+        await until(lambda: session.pool.statistics().waiting == 1)
+        fake_graph.serve(Echo, "/echo", echo)
+        assert await later == 3
+        assert session.pool.statistics().created == 1
+
+
+async def test_pool_full(fake_graph: FakeGraph) -> None:
+    fake_graph.serve(Echo, "/echo", echo)
+    async with opened(fake_graph, Limits(in_flight=1, waiting=2)) as session:
+        await ask(session, 0)
+        with fake_graph.hold_requests():
+            tasks = [asyncio.create_task(ask(session, i)) for i in range(3)]
+            await until(lambda: session.pool.statistics().waiting == 2)
+            with pytest.raises(PoolFull, match=r"Limits\.waiting=2"):
+                await ask(session, 3)
+        assert await asyncio.gather(*tasks) == [0, 1, 2]
+
+
+async def test_without_a_line_a_first_call_still_goes_through(fake_graph: FakeGraph) -> None:
+    fake_graph.serve(Echo, "/echo", echo)
+    async with opened(fake_graph, Limits(waiting=0)) as session:
+        assert await ask(session, 1) == 1
+
+
+async def test_idle_clients_are_evicted_and_made_again(fake_graph: FakeGraph) -> None:
+    fake_graph.serve(Echo, "/echo", echo)
+    async with opened(fake_graph, Limits(clients=3, in_flight=1, idle=TICK)) as session:
+        await asyncio.gather(*(ask(session, i) for i in range(3)))
+        assert session.pool.statistics().clients == 3
+        await until(lambda: session.pool.statistics().clients == 0)
+        assert clients(fake_graph) == []
+        assert await ask(session, 1) == 1
+        assert session.pool.statistics().created == 4
+
+
+async def test_a_client_somebody_waits_with_is_not_evicted(fake_graph: FakeGraph) -> None:
+    async with opened(fake_graph, Limits(idle=TICK)) as session:
+        task = asyncio.create_task(ask(session, 1))
+        watch = asyncio.create_task(session.wait_for_service(Echo, "/echo"))
+        await asyncio.sleep(3 * TICK)
+        assert session.pool.statistics().clients == 1
+        fake_graph.serve(Echo, "/echo", echo)
+        assert await task == 1
+        await watch
+
+
+async def test_warm(fake_graph: FakeGraph) -> None:
+    fake_graph.serve(Echo, "/echo", echo)
+    async with opened(fake_graph, Limits(clients=3, in_flight=1)) as session:
+        await session.pool.warm(Echo, "/echo", clients=3)
+        assert session.pool.statistics().created == 3
+        with pytest.raises(ValueError, match=r"Limits\.clients=3"):
+            await session.pool.warm(Echo, "/echo", clients=4)
+        await session.pool.warm(Echo, "/nobody")
+        assert session.pool.statistics().created == 4
+
+
+class TestLease:
+    """`ClientPool.lease`."""
+
+    async def test_every_way_out_gives_it_back(self, fake_graph: FakeGraph) -> None:
+        fake_graph.serve(Echo, "/echo", echo)
+        async with opened(fake_graph, Limits(in_flight=1)) as session:
+            async with session.pool.lease(Echo, "/echo") as client:
+                assert (await client.call(Echo.Request(1))).value == 1
+                assert (await client.call(Echo.Request(2))).value == 2
+            with pytest.raises(ZeroDivisionError):
+                async with session.pool.lease(Echo, "/echo"):
+                    raise ZeroDivisionError
+            assert session.pool.statistics().idle == 1
+            with pytest.raises(UsageError, match="is over"):
+                await client.call(Echo.Request(3))
+
+    async def test_it_carries_one_call_at_a_time(self, fake_graph: FakeGraph) -> None:
+        fake_graph.serve(Echo, "/echo", echo)
+        async with (
+            opened(fake_graph) as session,
+            session.pool.lease(Echo, "/echo") as client,
+        ):
+            with fake_graph.hold_requests():
+                task = asyncio.create_task(client.call(Echo.Request(1)))
+                await until(lambda: session.pool.statistics().in_flight == 1)
+                with pytest.raises(UsageError, match="one call at a time"):
+                    await client.call(Echo.Request(2))
+            assert (await task).value == 1
+
+    async def test_a_call_waits_for_the_place_its_predecessor_abandoned(
+        self, fake_graph: FakeGraph
+    ) -> None:
+        fake_graph.serve(Echo, "/echo", echo)
+        async with (
+            opened(fake_graph, Limits(in_flight=1)) as session,
+            session.pool.lease(Echo, "/echo") as client,
+        ):
+            with fake_graph.hold_requests():
+                with pytest.raises(ResponseTimeout):
+                    await client.call(Echo.Request(1), timeout=TICK)
+                with pytest.raises(QueueTimeout):
+                    await client.call(Echo.Request(2), timeout=TICK)
+                task = asyncio.create_task(client.call(Echo.Request(3)))
+                await asyncio.sleep(0)
+            assert (await task).value == 3
+            assert [port.most for port in clients(fake_graph)] == [1]
+
+    async def test_a_lease_in_vain(self, fake_graph: FakeGraph) -> None:
+        async with opened(fake_graph, Limits(in_flight=1)) as session:
+            with pytest.raises(ServiceUnavailable):
+                async with session.pool.lease(Echo, "/echo", timeout=TICK):
+                    pass
+            fake_graph.serve(Echo, "/echo", echo)
+            async with session.pool.lease(Echo, "/echo"):
+                with pytest.raises(QueueTimeout):
+                    async with session.pool.lease(Echo, "/echo", timeout=TICK):
+                        pass
+
+
+class TestRetry:
+    """`Retry`, where requests or responses get lost."""
+
+    async def test_what_was_lost_is_sent_again(self, fake_graph: FakeGraph) -> None:
+        server = fake_graph.serve(Echo, "/echo", echo)
+        async with opened(fake_graph) as session:
+            await ask(session, 0)
+            with fake_graph.drop_requests():
+                task = asyncio.create_task(ask(session, 1, retry=Retry(after=TICK)))
+                await until(lambda: session.pool.statistics().in_flight == 1)
+            assert await task == 1
+            total = session.pool.statistics()
+        assert (total.retried, total.abandoned, len(server.received)) == (1, 0, 2)
+
+    async def test_the_first_answer_wins_and_the_second_is_late(
+        self, fake_graph: FakeGraph
+    ) -> None:
+        fake_graph.serve(Echo, "/echo", echo)
+        async with opened(fake_graph) as session:
+            await ask(session, 0)
+            with fake_graph.delay_responses(3 * TICK):
+                task = asyncio.create_task(ask(session, 1, retry=Retry(after=2 * TICK)))
+                await until(lambda: session.pool.statistics().retried == 1)
+            assert await task == 1
+            assert session.pool.statistics().abandoned == 1
+            await until(lambda: session.pool.statistics().late == 1)
+            assert session.pool.statistics().abandoned == 0
+
+    async def test_the_attempts_end_and_the_deadline_holds(self, fake_graph: FakeGraph) -> None:
+        fake_graph.serve(Echo, "/echo", echo)
+        async with opened(fake_graph, Limits(grace=TICK)) as session:
+            await ask(session, 0)
+            with fake_graph.drop_requests(), pytest.raises(ResponseTimeout) as caught:
+                await ask(session, 1, retry=Retry(3, TICK, 1.0), timeout=6 * TICK)
+            assert caught.value.elapsed > 5 * TICK
+            total = session.pool.statistics()
+            assert (total.retried, total.abandoned) == (2, 3)
+            await until(lambda: session.pool.statistics().abandoned == 0)
+
+
+class TestEndings:
+    """The session or its context ends with callers in every phase."""
+
+    @pytest.mark.parametrize("how", ["closed", "shut down"])
+    async def test_every_caller_is_told(self, fake_graph: FakeGraph, how: str) -> None:
+        fake_graph.serve(Echo, "/echo", echo)
+        async with opened(fake_graph, Limits(in_flight=1)) as session:
+            node = session.node
+            assert isinstance(node, FakeNode)
+            with fake_graph.hold_requests():
+                calls = [
+                    ask(session, "in flight"),
+                    ask(session, "in line"),
+                    session.call(Echo, "/nobody", Echo.Request(), timeout=None),
+                    session.wait_for_service(Echo, "/nobody"),
+                ]
+                tasks = [asyncio.create_task(call) for call in calls]
+                await until(lambda: session.pool.statistics().waiting == 2)
+                if how == "closed":
+                    await session.aclose()
+                else:
+                    node.shutdown()
+                results = await asyncio.gather(*tasks, return_exceptions=True)
+            kind = SessionClosed if how == "closed" else ContextShutdown
+            assert [type(result) for result in results] == [kind] * 4
+            with pytest.raises(kind):
+                await ask(session, "too late")
+            total = session.pool.statistics()
+        assert (total.in_flight, total.waiting, total.clients, total.abandoned) == (0, 0, 0, 0)
+        assert clients(fake_graph) == []
+
+    async def test_a_context_that_goes_down_silently_is_noticed(
+        self, fake_graph: FakeGraph
+    ) -> None:
+        async with opened(fake_graph) as session:
+            task = asyncio.create_task(ask(session, 1, timeout=None))
+            await until(lambda: session.pool.statistics().waiting == 1)
+            node = session.node
+            assert isinstance(node, FakeNode)
+            node.up = False
+            with pytest.raises(ContextShutdown):
+                await task
+
+    async def test_an_idle_pool_has_no_timer_but_the_eviction(self, fake_graph: FakeGraph) -> None:
+        fake_graph.serve(Echo, "/echo", echo)
+        async with opened(fake_graph) as session:
+            await ask(session, 1)
+            loop: Any = asyncio.get_running_loop()
+
+            def awake() -> int:
+                return sum(not timer.cancelled() for timer in loop._scheduled)
+
+            await until(lambda: awake() <= 2)  # the eviction, and until's own sleep
+
+
+async def test_several_servers_of_one_name_are_warned_of_once(
+    fake_graph: FakeGraph, caplog: pytest.LogCaptureFixture
+) -> None:
+    fake_graph.serve(Echo, "/echo", echo)
+    fake_graph.serve(Echo, "/echo", echo)
+    async with opened(fake_graph) as session:
+        with caplog.at_level(logging.WARNING, "rosasync"):
+            for value in range(3):
+                assert await ask(session, value) == value
+            fake_graph.changed()
+            assert await ask(session, 3) == 3
+    assert [r.getMessage().split(";")[0] for r in caplog.records] == [
+        "/echo: 2 servers answer this name"
+    ]
+
+
+async def test_a_storm_leaves_nothing(fake_graph: FakeGraph) -> None:
+    """Calls cancelled and timed out at random, among others: none of the others is lost."""
+    dice = random.Random(1)
+    server = fake_graph.serve(Echo, "/echo", echo)
+
+    async def caller(number: int) -> None:
+        kind = dice.randrange(3)
+        if kind == 0:
+            assert await ask(session, number, timeout=60.0) == number
+        elif kind == 1:
+            with suppress(TimeoutError):
+                assert await ask(session, number, timeout=dice.random() * TICK / 5) == number
+        else:
+            task = asyncio.create_task(ask(session, number, timeout=60.0))
+            await asyncio.sleep(dice.random() * TICK / 5)
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+
+    async with opened(fake_graph, Limits(clients=2, in_flight=5)) as session:
+        with fake_graph.delay_responses(TICK / 50):
+            await asyncio.gather(*(caller(number) for number in range(2000)))
+        await until(lambda: session.pool.statistics().abandoned == 0)
+        total = session.pool.statistics()
+        assert (total.in_flight, total.waiting, total.idle) == (0, 0, 2)
+        assert max(client.most for client in clients(fake_graph)) <= 5
+        assert total.completed + total.timed_out + total.cancelled == 2000
+    assert server.lost == 0
+
+
+async def test_reprs_tell_state_and_counts(fake_graph: FakeGraph) -> None:
+    fake_graph.serve(Echo, "/echo", echo)
+    session = fake_graph.session()
+    assert "not open" in repr(session)
+    async with session:
+        await ask(session, 1)
+        assert repr(session.pool) == (
+            "<ClientPool 1 services, 1 clients, 1 idle, 0 in flight, 0 waiting>"
+        )
+        async with session.pool.lease(Echo, "/echo") as client:
+            assert repr(client) == "<LeasedClient /echo idle>"
+        assert repr(session.client(Echo, "/echo")).startswith("<ServiceClient /echo")
+    assert repr(session) == "<Session 'fake' closed>"

@@ -1,0 +1,173 @@
+"""What every port keeps to, fake and real: one suite for all of them."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Awaitable, Callable
+from typing import Any, Literal
+
+import pytest
+
+from rosasync import InvalidServiceName
+from rosasync.ros.node import RosNode
+from rosasync.ros.ports import ClientPort, NodePort
+from rosasync.testing import FakeGraph, FakeNode
+from tests.support.echo import ECHO, answer_to, fill, request_of, service_class
+from tests.support.servers import ServerProcess
+from tests.support.times import until
+
+Kind = Literal["fake", "direct", "executor"]
+
+
+class World:
+    """A node under test, and a way to have servers come and go."""
+
+    node: NodePort
+
+    def __init__(
+        self,
+        serve: Callable[[str], Awaitable[object]],
+        vanish: Callable[[str], Awaitable[object]],
+    ) -> None:
+        self.serve = serve
+        self.vanish = vanish
+        self.changes = 0
+        self.responses: list[tuple[int, str]] = []
+
+    def changed(self) -> None:
+        self.changes += 1
+
+    def client(self, srv_name: str = "/port_echo") -> ClientPort:
+        srv_type, _, _ = self.node.describe(ECHO, None)
+        return self.node.open_client(srv_type, srv_name, None, self._deliver)
+
+    def _deliver(self, sequence_number: int, response: Any) -> None:
+        self.responses.append((sequence_number, answer_to(response)))
+
+
+@pytest.fixture(params=["fake", "direct", "executor"])
+async def world(request: pytest.FixtureRequest) -> AsyncIterator[World]:
+    kind: Kind = request.param
+    if kind == "fake":
+        graph = FakeGraph()
+        fake = FakeNode(graph)
+        response_class = service_class(ECHO).Response
+
+        async def serve(name: str) -> None:
+            graph.serve(ECHO, name, lambda request: fill(request, response_class()))
+
+        async def vanish(name: str) -> None:
+            graph.find(ECHO, name)[0].close()
+
+        world = World(serve, vanish)
+        world.node = fake
+        fake.attach(world.changed, lambda: None)
+        yield world
+        fake.close()
+        return
+    server: ServerProcess = request.getfixturevalue("server")
+    world = World(serve=server.serve, vanish=server.stop)
+    real = RosNode("test_ports", None, None, kind, world.changed, lambda: None)
+    world.node = real
+    yield world
+    real.stop()
+    await real.stopped()
+    assert real.join()
+    real.close()
+
+
+async def test_each_response_carries_the_number_of_its_request(world: World) -> None:
+    await world.serve("/port_echo")
+    client = world.client()
+    await until(client.ready)
+    numbers = [client.send(request_of(str(i))) for i in range(5)]
+    assert numbers == sorted(set(numbers))
+    await until(lambda: len(world.responses) == 5)
+    assert dict(world.responses) == {number: str(i) for i, number in enumerate(numbers)}
+    client.close()
+
+
+async def test_responses_come_on_the_loop_and_never_within_send(world: World) -> None:
+    await world.serve("/port_echo")
+    client = world.client()
+    await until(client.ready)
+    client.send(request_of("x"))
+    assert world.responses == []
+    await until(lambda: world.responses)
+    client.close()
+
+
+async def test_ready_follows_the_server(world: World) -> None:
+    client = world.client()
+    assert not client.ready()
+    await world.serve("/port_echo")
+    await until(client.ready)
+    assert world.node.servers("/port_echo") == 1
+    assert world.node.provides(ECHO, "/port_echo")
+    assert not world.node.provides("std_srvs/srv/Empty", "/port_echo")
+    await world.vanish("/port_echo")
+    await until(lambda: not client.ready())
+    await until(lambda: world.node.servers("/port_echo") == 0)
+    client.close()
+
+
+async def test_a_change_of_the_graph_is_told(world: World) -> None:
+    assert world.node.graph_events
+    client = world.client()
+    before = world.changes
+    await world.serve("/port_echo")
+    await until(lambda: world.changes > before)
+    client.close()
+
+
+async def test_a_forgotten_request_does_not_disturb_the_next(world: World) -> None:
+    await world.serve("/port_echo")
+    client = world.client()
+    await until(client.ready)
+    first = client.send(request_of("forgotten"))
+    client.forget(first)
+    client.forget(first)
+    second = client.send(request_of("wanted"))
+    await until(lambda: (second, "wanted") in world.responses)
+    client.close()
+
+
+async def test_nothing_comes_after_close(world: World) -> None:
+    await world.serve("/port_echo")
+    client = world.client()
+    other = world.client()
+    await until(lambda: client.ready() and other.ready())
+    client.send(request_of("too late"))
+    client.close()
+    client.close()
+    number = other.send(request_of("in time"))
+    await until(lambda: world.responses)
+    await asyncio.sleep(0)
+    assert world.responses == [(number, "in time")]
+    other.close()
+
+
+async def test_names_are_resolved_or_refused(world: World) -> None:
+    assert world.node.resolve("port_echo") == "/port_echo"
+    for name in ("", "/", "/with space", "/1st", "/double//slash"):
+        with pytest.raises(InvalidServiceName, match="is no service name"):
+            world.node.resolve(name)
+
+
+async def test_types_and_requests_are_checked(world: World) -> None:
+    srv_type, name, qos = world.node.describe(ECHO, None)
+    assert (name, qos) == (ECHO, None)
+    request = world.node.request(srv_type, {"load_namespace": "x"})
+    assert isinstance(request, srv_type.Request)
+    assert world.node.request(srv_type, request) is request
+    with pytest.raises(TypeError):
+        world.node.request(srv_type, srv_type.Response())
+    with pytest.raises(ValueError, match="no_such_package"):
+        world.node.describe("no_such_package/srv/Nothing", None)
+
+
+async def test_what_is_seen_instead(world: World) -> None:
+    await world.serve("/port_echo")
+    await until(lambda: world.node.servers("/port_echo"))
+    assert "/port_echo" in world.node.seen_instead(ECHO, "/port_ecco")
+    assert world.node.ok()
