@@ -12,12 +12,10 @@ def main() -> None:
     try:
         from rosasync.cli import app
     except ModuleNotFoundError as error:
-        if error.name not in {"rich", "typer"}:
+        missing = (error.name or "").partition(".")[0]
+        if missing not in {"rich", "typer"}:
             raise
-        print(
-            f"The rosasync command needs {error.name}: pip install 'rosasync[cli]'",
-            file=sys.stderr,
-        )
+        print(f"The rosasync command needs {missing}: pip install 'rosasync[cli]'", file=sys.stderr)
         sys.exit(2)
     app()
 

@@ -38,7 +38,7 @@ AT_ONCE = (1, 10)
 ROUNDS = 10
 WARM_UP = 20
 CALL_TIMEOUT = 3.0
-START_LIMIT, END_LIMIT = 7.0, 1.5
+START_LIMIT, END_LIMIT = 8.0, 1.5
 """Seconds for start-up, and for the server to end once asked, before it is killed."""
 
 
@@ -230,9 +230,13 @@ async def _run(calls: int, seconds: float) -> Report:
         asyncio.timeout(START_LIMIT + seconds),
         rosasync.Session("rosasync_demo", timeout=CALL_TIMEOUT) as session,
         _stock_server(),
-        _stock_client() as client,
     ):
-        with ThreadPoolExecutor(max(AT_ONCE)) as threads:
+        from rosasync.ros.stock import Echo
+
+        with _stock_client() as client, ThreadPoolExecutor(max(AT_ONCE)) as threads:
+            await session.wait_for_service(Echo, SRV_NAMES[OURS], timeout=START_LIMIT)
+            if not await asyncio.to_thread(client.wait_for_service, START_LIMIT):
+                raise DemoError(f"{STOCK} does not see the server")
             contestants = _Contestants(session, client, threads)
             return Report(session.bridge, await _measure(contestants, calls, seconds))
 
@@ -264,14 +268,12 @@ async def _stock_server() -> AsyncIterator[None]:
             await process.wait()
 
 
-@asynccontextmanager
-async def _stock_client() -> AsyncIterator[ThreadedClient]:
+@contextmanager
+def _stock_client() -> Iterator[ThreadedClient]:
     from rosasync.ros.stock import ThreadedClient
 
     client = ThreadedClient(SRV_NAMES[STOCK])
     try:
-        if not await asyncio.to_thread(client.wait_for_service, CALL_TIMEOUT):
-            raise DemoError(f"{STOCK} does not see the server")
         yield client
     finally:
         client.close()

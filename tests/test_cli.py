@@ -1,0 +1,168 @@
+"""The command line: the demo for real, its endings, and what is said where an extra is missing."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from importlib.metadata import PackageNotFoundError, version
+
+import psutil
+import pytest
+
+from rosasync.demo import Report, Samples
+from rosasync.ros.stock import READY
+
+LIMIT = 30.0
+ROSASYNC = (sys.executable, "-m", "rosasync")
+
+
+def run(*command: str, **environ: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        command,
+        capture_output=True,
+        text=True,
+        stdin=subprocess.DEVNULL,
+        timeout=LIMIT,
+        env={**os.environ, **environ},
+        check=False,
+    )
+
+
+def run_without(module: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run the command line in an interpreter that cannot import the module."""
+    code = f"import sys; sys.modules[{module!r}] = None; sys.argv[1:] = {arguments!r}; "
+    return run(sys.executable, "-c", code + "from rosasync.__main__ import main; main()")
+
+
+def test_version() -> None:
+    try:
+        expected = f"rosasync {version('rosasync')}\n"
+    except PackageNotFoundError:
+        expected = "rosasync, not installed: run from a source tree\n"
+    done = run(*ROSASYNC, "--version")
+    assert (done.returncode, done.stdout) == (0, expected)
+
+
+@pytest.mark.parametrize("module", ["rich", "typer"])
+def test_without_the_cli_extra_it_says_so(module: str) -> None:
+    done = run_without(module, "--version")
+    assert done.returncode == 2
+    assert done.stderr == f"The rosasync command needs {module}: pip install 'rosasync[cli]'\n"
+
+
+def test_demo_without_rclpy_says_which_extra() -> None:
+    done = run_without("rclpy", "demo")
+    assert done.returncode == 1
+    assert "rosasync[jazzy]" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert done.stdout == ""
+
+
+def test_demo_prints_json_alone() -> None:
+    done = run(*ROSASYNC, "demo", "--json", "--calls", "200")
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert report["bridge"] in {"direct", "executor"}
+    assert [contest["at_once"] for contest in report["contests"]] == [1, 10]
+    for contest in report["contests"]:
+        ours, stock = contest["rosasync"], contest["client.call"]
+        assert ours["calls"] == stock["calls"] == 200
+        for figures in (ours, stock):
+            assert 0 < figures["median_us"] <= figures["p99_us"]
+        assert contest["ratio"]["median"] == pytest.approx(ours["median_us"] / stock["median_us"])
+
+
+def test_demo_shows_table_and_histogram_where_stdout_knows_no_unicode() -> None:
+    done = run(*ROSASYNC, "demo", "--calls", "20", PYTHONIOENCODING="ascii")
+    assert done.returncode == 0, done.stderr
+    for text in ("median", "99 %", "calls/s", "CPU per call", "ratio", "Latency", "240 calls"):
+        assert text in done.stdout
+
+
+def test_demo_stops_measuring_when_its_seconds_are_over() -> None:
+    done = run(*ROSASYNC, "demo", "--json", "--calls", "1000000", "--seconds", "0.5")
+    assert done.returncode == 0, done.stderr
+    for contest in json.loads(done.stdout)["contests"]:
+        assert 0 < contest["rosasync"]["calls"] < 1_000_000
+        assert 0 < contest["client.call"]["calls"] < 1_000_000
+
+
+@contextmanager
+def terminal() -> Iterator[tuple[int, int]]:
+    """A pseudo-terminal: the end to read from, the end to hand to a process."""
+    ours, theirs = pty.openpty()
+    try:
+        yield ours, theirs
+    finally:
+        os.close(ours)
+
+
+def read_until(fd: int, text: bytes) -> bytes:
+    seen = b""
+    while text not in seen:
+        seen += os.read(fd, 4096)
+    return seen
+
+
+def read_to_end(fd: int) -> bytes:
+    seen = b""
+    with suppress(OSError):  # how a terminal says that nobody holds its other end any more
+        while chunk := os.read(fd, 4096):
+            seen += chunk
+    return seen
+
+
+def test_ctrl_c_ends_the_demo_and_its_server() -> None:
+    command = (*ROSASYNC, "demo", "--json", "--calls", "1000000", "--seconds", "60")
+    with terminal() as (screen, stderr):
+        demo = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=stderr, start_new_session=True
+        )
+        os.close(stderr)
+        try:
+            read_until(screen, b"at once")  # the progress bar: calls are being made
+            (server,) = psutil.Process(demo.pid).children()
+            os.killpg(demo.pid, signal.SIGINT)
+            stdout, _ = demo.communicate(timeout=LIMIT)
+        finally:
+            demo.kill()
+            demo.wait()
+        shown = read_to_end(screen)
+    assert demo.returncode == 130
+    assert not server.is_running()
+    assert stdout == b""
+    assert b"Traceback" not in shown
+    assert b"Exception" not in shown
+
+
+def test_stock_server_ends_with_its_standard_input() -> None:
+    command = (sys.executable, "-m", "rosasync.ros.stock", "/rosasync_test/echo")
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as server:
+        assert server.stdin is not None
+        assert server.stdout is not None
+        assert server.stdout.readline() == READY
+        server.stdin.close()
+        assert server.wait(LIMIT) == 0
+
+
+def test_figures() -> None:
+    figures = Samples([1e-4 * n for n in range(1, 201)], wall=2.0, cpu=1.0).figures()
+    assert figures.median_us == pytest.approx(10_050)
+    assert figures.p99_us == pytest.approx(19_800)
+    assert figures.calls_per_s == 100
+    assert figures.cpu_us_per_call == 5_000
+
+
+def test_report_of_equal_latencies() -> None:
+    samples = Samples([1e-3], wall=1e-3, cpu=1e-3)
+    turns = {(name, n): samples for name in ("rosasync", "client.call") for n in (1, 10)}
+    report = Report("direct", turns)
+    (first, _) = json.loads(report.as_json())["contests"]
+    assert set(first["ratio"].values()) == {1.0}
+    assert report.as_text().renderables
