@@ -1,0 +1,167 @@
+"""The command line: ``python -m benchmarks``."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import Progress
+
+from benchmarks.machine import describe_machine
+from benchmarks.results import Results
+from benchmarks.runner import Runner
+from benchmarks.suites import SUITES, make_suite
+from benchmarks.tables import scenario_table, target_table
+from rosasync.ros.domain import isolate
+
+ROUNDS, QUICK_ROUNDS = 9, 5
+PINNED_CORES = 4
+WIDTH = 150
+
+Quick = Annotated[bool, typer.Option("--quick", help="Fewer calls and rounds.")]
+Rounds = Annotated[int | None, typer.Option(min=1, help=f"{ROUNDS}, or {QUICK_ROUNDS} if quick.")]
+Json = Annotated[Path | None, typer.Option("--json", help="Write the raw samples here.")]
+Pin = Annotated[
+    bool | None, typer.Option(help="Half of the cores for the server; by default if four or more.")
+]
+Chosen = Annotated[str, typer.Option("--contestants", help="Only these: a,b,c.")]
+
+app = typer.Typer(help=__doc__, no_args_is_help=True, pretty_exceptions_enable=False)
+
+
+@app.command()
+def latency(
+    quick: Quick = False,
+    rounds: Rounds = None,
+    json: Json = None,
+    contestants: Chosen = "",
+    pin: Pin = None,
+) -> None:
+    """Time of a call, calls at once, idle clients, idle CPU and memory: the targets."""
+    measure(["latency"], quick, rounds, json, contestants, pin)
+
+
+@app.command()
+def throughput(
+    quick: Quick = False,
+    rounds: Rounds = None,
+    json: Json = None,
+    contestants: Chosen = "",
+    pin: Pin = None,
+) -> None:
+    """Calls per second of 1, 8, 64 and 512 callers."""
+    measure(["throughput"], quick, rounds, json, contestants, pin)
+
+
+@app.command()
+def scale(
+    quick: Quick = False,
+    rounds: Rounds = None,
+    json: Json = None,
+    contestants: Chosen = "",
+    pin: Pin = None,
+) -> None:
+    """Many services, idle clients, large responses and slow servers."""
+    measure(["scale"], quick, rounds, json, contestants, pin)
+
+
+@app.command()
+def idle(
+    quick: Quick = False,
+    rounds: Rounds = None,
+    json: Json = None,
+    contestants: Chosen = "",
+    pin: Pin = None,
+) -> None:
+    """CPU of a client that calls nothing."""
+    measure(["idle"], quick, rounds, json, contestants, pin)
+
+
+@app.command()
+def memory(
+    quick: Quick = False,
+    rounds: Rounds = None,
+    json: Json = None,
+    contestants: Chosen = "",
+    pin: Pin = None,
+) -> None:
+    """Memory after 100,000 calls, above that after 10,000."""
+    measure(["memory"], quick, rounds, json, contestants, pin)
+
+
+@app.command("all")
+def everything(
+    quick: Quick = False,
+    rounds: Rounds = None,
+    json: Json = None,
+    contestants: Chosen = "",
+    pin: Pin = None,
+) -> None:
+    """Everything there is to measure."""
+    measure(list(SUITES), quick, rounds, json, contestants, pin)
+
+
+@app.command()
+def report(
+    files: Annotated[list[Path], typer.Argument(exists=True, help="Results saved with --json.")],
+    out: Annotated[Path, typer.Option(help="The folder of the documentation.")] = Path("docs"),
+) -> None:
+    """Turn saved results into docs/benchmarks.md with its plots."""
+    from benchmarks.report import write_report
+
+    typer.echo(write_report(Results.load(files), out))
+
+
+def measure(
+    suites: list[str],
+    quick: bool,
+    rounds: int | None,
+    json: Path | None,
+    contestants: str,
+    pin: bool | None,
+) -> None:
+    chosen = [key.strip() for key in contestants.split(",") if key.strip()]
+    try:
+        found = [make_suite(name, quick=quick, contestants=chosen) for name in suites]
+    except ValueError as exc:
+        raise typer.BadParameter(str(exc)) from None
+    scenarios = {scenario.key: scenario for suite in found for scenario in suite}
+    isolate()
+    rounds = rounds or (QUICK_ROUNDS if quick else ROUNDS)
+    pin = len(os.sched_getaffinity(0)) >= PINNED_CORES if pin is None else pin
+    settings = {"suites": suites, "quick": quick, "rounds": rounds, "pin": pin}
+    results = Results(describe_machine(), settings)
+    console = make_console()
+    try:
+        with (
+            Progress(console=console) as progress,
+            Runner(rounds, pin, results, progress) as runner,
+        ):
+            runner.run(list(scenarios.values()))
+    except KeyboardInterrupt:
+        console.print("interrupted: these are the rounds that ended")
+    show(console, results)
+    if json:
+        results.save(json)
+
+
+def make_console() -> Console:
+    """The terminal, or where there is none, lines wide enough for a table."""
+    console = Console()
+    return console if console.is_terminal else Console(width=WIDTH)
+
+
+def show(console: Console, results: Results) -> None:
+    for scenario in results.scenarios:
+        if results.contestants(scenario):
+            console.print(scenario_table(results, scenario))
+    targets = target_table(results)
+    if targets:
+        console.print(targets)
+
+
+if __name__ == "__main__":
+    app()

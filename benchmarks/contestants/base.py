@@ -1,0 +1,283 @@
+"""What every contestant answers to, and the loops that time its calls."""
+
+from __future__ import annotations
+
+import asyncio
+import queue
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+from benchmarks.pipes import describe
+from benchmarks.work import READY_TIMEOUT, Work, load_type, make_handler, make_qos
+
+__all__ = [
+    "Asynchronous",
+    "Blocking",
+    "Contestant",
+    "Soaking",
+    "Tally",
+    "Windowed",
+    "answered",
+    "make_clients",
+    "spinning",
+]
+
+now = time.perf_counter_ns
+
+
+@dataclass
+class Tally:
+    """What came of a run of calls: times in ns, and how many calls got no answer."""
+
+    samples: list[int] = field(default_factory=list)
+    elapsed: int = 0
+    lost: int = 0
+    failed: int = 0
+    error: str = ""
+    _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
+
+    def miss(self, exc: BaseException) -> None:
+        """Counts a call that ended in `exc`: lost where that is a timeout, else failed."""
+        with self._lock:
+            if isinstance(exc, TimeoutError):
+                self.lost += 1
+            else:
+                self.failed += 1
+                self.error = self.error or describe(exc)
+
+    @contextmanager
+    def timed(self) -> Iterator[None]:
+        begin = now()
+        yield
+        self.elapsed = now() - begin
+
+
+class Contestant(Protocol):
+    """One way to call services, in a process of its own.
+
+    A run ends after `calls` calls, or when `seconds` are over: calls that are out then are still
+    waited for, no new ones are made.
+    """
+
+    def setup(self, work: Work) -> None:
+        """Makes the clients for `work`, and returns when their servers were found."""
+
+    def one_at_a_time(self, calls: int, seconds: float) -> Tally:
+        """Makes the next call when the last one is answered."""
+
+    def at_once(self, callers: int, calls: int, seconds: float) -> Tally:
+        """Keeps as many calls out as there are callers."""
+
+    def rest(self, seconds: float) -> None:
+        """Stays ready, and calls nothing."""
+
+    def close(self) -> None:
+        """Takes down what `setup` made."""
+
+
+class Soaking(Contestant, Protocol):
+    """A contestant that can be watched for leaks."""
+
+    def soak(self, calls: int) -> Tally:
+        """Makes calls of which a third each is answered, times out and is cancelled."""
+
+
+class Blocking(ABC):
+    """A contestant whose callers are threads, each blocked until its call is answered."""
+
+    services = 1
+
+    @abstractmethod
+    def call(self, service: int) -> None:
+        """Makes one call; raises TimeoutError where no answer came."""
+
+    def one_at_a_time(self, calls: int, seconds: float) -> Tally:
+        tally = Tally()
+        with tally.timed():
+            self._caller(range(calls), _until(seconds), tally)
+        return tally
+
+    def at_once(self, callers: int, calls: int, seconds: float) -> Tally:
+        tally = Tally()
+        until = _until(seconds)
+        threads = [
+            threading.Thread(target=self._caller, args=(range(i, calls, callers), until, tally))
+            for i in range(callers)
+        ]
+        with tally.timed():
+            for thread in threads:
+                thread.start()
+            for thread in threads:
+                thread.join()
+        return tally
+
+    def rest(self, seconds: float) -> None:
+        time.sleep(seconds)
+
+    def _caller(self, calls: range, until: int, tally: Tally) -> None:
+        for i in calls:
+            begin = now()
+            if begin > until:
+                return
+            try:
+                self.call(i % self.services)
+            except Exception as exc:
+                tally.miss(exc)
+            else:
+                tally.samples.append(now() - begin)
+
+
+class Windowed(ABC):
+    """A contestant that starts calls and is told when they are over."""
+
+    services = 1
+
+    @abstractmethod
+    def start(self, service: int, over: Callable[[Exception | None], None]) -> None:
+        """Starts one call, and calls `over` from any thread when it has ended."""
+
+    def one_at_a_time(self, calls: int, seconds: float) -> Tally:
+        return self.at_once(1, calls, seconds)
+
+    def at_once(self, callers: int, calls: int, seconds: float) -> Tally:
+        tally = Tally()
+        until = _until(seconds)
+        ended: queue.SimpleQueue[tuple[int, Exception | None]] = queue.SimpleQueue()
+        started = out = 0
+        with tally.timed():
+            while True:
+                while out < callers and started < calls and (begin := now()) < until:
+                    self.start(started % self.services, _report(ended, begin))
+                    started += 1
+                    out += 1
+                if not out:
+                    return tally
+                begin, exc = ended.get()
+                out -= 1
+                if exc is None:
+                    tally.samples.append(now() - begin)
+                else:
+                    tally.miss(exc)
+
+    def rest(self, seconds: float) -> None:
+        time.sleep(seconds)
+
+
+class Asynchronous(ABC):
+    """A contestant whose callers are asyncio tasks."""
+
+    services = 1
+    loop_factory: Callable[[], asyncio.AbstractEventLoop] | None = None
+
+    @abstractmethod
+    async def open(self, work: Work) -> None: ...
+
+    @abstractmethod
+    async def call(self, service: int) -> None:
+        """Makes one call; raises TimeoutError where no answer came."""
+
+    @abstractmethod
+    async def shut(self) -> None: ...
+
+    def setup(self, work: Work) -> None:
+        self.services = work.services
+        self.runner = asyncio.Runner(loop_factory=self.loop_factory)
+        self.runner.run(self.open(work))
+
+    def one_at_a_time(self, calls: int, seconds: float) -> Tally:
+        return self.runner.run(self._tasks(1, calls, seconds))
+
+    def at_once(self, callers: int, calls: int, seconds: float) -> Tally:
+        return self.runner.run(self._tasks(callers, calls, seconds))
+
+    def rest(self, seconds: float) -> None:
+        self.runner.run(asyncio.sleep(seconds))
+
+    def close(self) -> None:
+        with self.runner:
+            self.runner.run(self.shut())
+
+    async def _tasks(self, callers: int, calls: int, seconds: float) -> Tally:
+        tally = Tally()
+        until = _until(seconds)
+        with tally.timed():
+            async with asyncio.TaskGroup() as group:
+                for i in range(callers):
+                    group.create_task(self._caller(range(i, calls, callers), until, tally))
+        return tally
+
+    async def _caller(self, calls: range, until: int, tally: Tally) -> None:
+        for i in calls:
+            begin = now()
+            if begin > until:
+                return
+            try:
+                await self.call(i % self.services)
+            except Exception as exc:
+                tally.miss(exc)
+            else:
+                tally.samples.append(now() - begin)
+
+
+def answered(response: object) -> None:
+    """Turns the None by which ``client.call`` reports a timeout in Jazzy into a TimeoutError."""
+    if response is None:
+        raise TimeoutError("no response")
+
+
+def make_clients(node: Any, work: Work, callback_group: Any = None) -> list[Any]:
+    """The stock clients for `work` on `node`, their servers found, and the idle ones beside them.
+
+    Where the server belongs inside, it is made on the same node.
+    """
+    srv_type, qos = load_type(work.srv_type), make_qos(work.depth)
+    options = {"qos_profile": qos, "callback_group": callback_group}
+    if work.server == "inside":
+        for name in work.names:
+            node.create_service(srv_type, name, make_handler(work), **options)
+    clients = [node.create_client(srv_type, name, **options) for name in work.names]
+    for name in work.idle_names:
+        node.create_client(srv_type, name, **options)
+    for client in clients:
+        if not client.wait_for_service(timeout_sec=READY_TIMEOUT):
+            raise RuntimeError(f"no server for {client.srv_name}")
+    return clients
+
+
+@contextmanager
+def spinning(node: Any, executor: Any) -> Iterator[None]:
+    """Spins `node` in a thread; ends with rclpy shut down, node and thread gone."""
+    import rclpy
+
+    thread = threading.Thread(target=_spin, args=(executor,), daemon=True)
+    executor.add_node(node)
+    thread.start()
+    try:
+        yield
+    finally:
+        rclpy.try_shutdown()
+        thread.join()
+        executor.shutdown()
+        node.destroy_node()
+
+
+def _spin(executor: Any) -> None:
+    from rclpy.executors import ExternalShutdownException
+
+    with suppress(ExternalShutdownException):
+        executor.spin()
+
+
+def _until(seconds: float) -> int:
+    return now() + round(seconds * 1e9)
+
+
+def _report(
+    ended: queue.SimpleQueue[tuple[int, Exception | None]], begin: int
+) -> Callable[[Exception | None], None]:
+    return lambda exc: ended.put((begin, exc))

@@ -1,0 +1,61 @@
+"""``rclpy.spin_until_future_complete``, as the ROS 2 tutorials call a service."""
+
+from __future__ import annotations
+
+import time
+
+import rclpy
+
+from benchmarks.contestants.base import Blocking, Tally, make_clients, now
+from benchmarks.work import CALL_TIMEOUT, Work, make_request
+
+
+class SpinUntilComplete(Blocking):
+    def setup(self, work: Work) -> None:
+        self.services = work.services
+        rclpy.init()
+        self._node = rclpy.create_node("bench")
+        self._clients = make_clients(self._node, work)
+        self._request = make_request(work)
+
+    def call(self, service: int) -> None:
+        self._complete(self._clients[service].call_async(self._request))
+
+    def at_once(self, callers: int, calls: int, seconds: float) -> Tally:
+        """One thread may spin the node: so the calls go out in batches, one for each caller."""
+        tally = Tally()
+        until = now() + round(seconds * 1e9)
+        with tally.timed():
+            for first in range(0, calls, callers):
+                if now() > until:
+                    break
+                batch = [
+                    (now(), self._clients[i % self.services].call_async(self._request))
+                    for i in range(first, min(first + callers, calls))
+                ]
+                for begin, future in batch:
+                    try:
+                        self._complete(future)
+                    except Exception as exc:
+                        tally.miss(exc)
+                    else:
+                        tally.samples.append(now() - begin)
+        return tally
+
+    def rest(self, seconds: float) -> None:
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0:
+            rclpy.spin_once(self._node, timeout_sec=left)
+
+    def close(self) -> None:
+        self._node.destroy_node()
+        rclpy.shutdown()
+
+    def _complete(self, future: rclpy.task.Future) -> None:
+        rclpy.spin_until_future_complete(self._node, future, timeout_sec=CALL_TIMEOUT)
+        if not future.done():
+            raise TimeoutError("no response")
+        future.result()
+
+
+CONTESTANTS = {"spin-until": SpinUntilComplete}

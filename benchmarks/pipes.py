@@ -1,0 +1,161 @@
+"""A child process that answers JSON lines, seen from both ends."""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import select
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+__all__ = ["Child", "ChildError", "Hung", "answer_lines", "describe"]
+
+Message = dict[str, Any]
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+class ChildError(Exception):
+    """The child answered with an error, or ended."""
+
+
+class Hung(ChildError):
+    """The child did not answer in time."""
+
+
+class Child:
+    """A Python module run as a process of its own, asked for one thing at a time."""
+
+    def __init__(self, module: str, *args: str, cores: set[int] | None = None) -> None:
+        self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the child
+        # A session of its own: Ctrl-C is the parent's to handle, and a kill reaches grandchildren.
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", module, *args],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._stderr,
+            cwd=ROOT,
+            start_new_session=True,
+        )
+        self._buffer = bytearray()
+        if cores:
+            os.sched_setaffinity(self._process.pid, cores)
+
+    def ask(self, do: str, *, timeout: float, **message: Any) -> Message:
+        """Sends one message and returns its answer.
+
+        Raises:
+            Hung: no answer within `timeout` seconds. The child is of no use any more: kill it.
+            ChildError: the answer is an error, or the child has ended.
+        """
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(json.dumps({"do": do, **message}).encode() + b"\n")
+            self._process.stdin.flush()
+        except BrokenPipeError:
+            raise ChildError(self._epitaph()) from None
+        answer: Message = json.loads(self._line(time.monotonic() + timeout, do))
+        if "error" in answer:
+            raise ChildError(answer["error"])
+        return answer
+
+    def close(self, timeout: float = 10.0) -> None:
+        """Ends the child by closing its input, or by force where it does not listen."""
+        assert self._process.stdin is not None
+        with suppress(BrokenPipeError):
+            self._process.stdin.close()
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(timeout)
+        self.kill()
+
+    def kill(self) -> None:
+        """Ends the child and everything it started."""
+        with suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait()
+        for pipe in (self._process.stdin, self._process.stdout, self._stderr):
+            assert pipe is not None
+            with suppress(BrokenPipeError):
+                pipe.close()
+
+    def __enter__(self) -> Child:
+        return self
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        tb: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _line(self, deadline: float, do: str) -> bytes:
+        assert self._process.stdout is not None
+        fd = self._process.stdout.fileno()
+        while (end := self._buffer.find(b"\n")) < 0:
+            ready, _, _ = select.select([fd], [], [], max(0.0, deadline - time.monotonic()))
+            if not ready:
+                raise Hung(f"no answer to {do!r} in time")
+            chunk = os.read(fd, 1 << 20)
+            if not chunk:
+                raise ChildError(self._epitaph())
+            self._buffer += chunk
+        line = bytes(self._buffer[:end])
+        del self._buffer[: end + 1]
+        return line
+
+    def _epitaph(self) -> str:
+        code = self._process.wait()
+        self._stderr.seek(0)
+        last = self._stderr.read().decode(errors="replace").strip().splitlines()[-3:]
+        return " / ".join([f"ended with code {code}", *last])
+
+
+def answer_lines(answer: Callable[[Message], Message]) -> None:
+    """Answers every line of standard input with a line of standard output, until the input ends.
+
+    What else the process prints goes to standard error. An input that ends while `answer` is stuck
+    ends the process after 5 s.
+    """
+    requests, output = os.dup(0), os.dup(1)
+    with open(os.devnull, "rb") as nothing:
+        os.dup2(nothing.fileno(), 0)
+    os.dup2(2, 1)
+    lines: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
+    threading.Thread(target=_read_lines, args=(requests, lines), daemon=True).start()
+    with os.fdopen(output, "wb") as answers:
+        while (line := lines.get()) is not None:
+            try:
+                reply = answer(json.loads(line))
+            except Exception as exc:
+                traceback.print_exc()
+                reply = {"error": describe(exc)}
+            answers.write(json.dumps(reply, separators=(",", ":")).encode() + b"\n")
+            answers.flush()
+
+
+def describe(exc: BaseException) -> str:
+    """An exception in one line; of a group, the first that is none."""
+    while isinstance(exc, BaseExceptionGroup):
+        exc = exc.exceptions[0]
+    return f"{type(exc).__name__}: {exc}"
+
+
+def _read_lines(fd: int, lines: queue.SimpleQueue[bytes | None]) -> None:
+    with os.fdopen(fd, "rb", buffering=0) as requests:
+        for line in requests:
+            lines.put(line)
+    lines.put(None)
+    time.sleep(5.0)
+    os._exit(1)

@@ -1,0 +1,202 @@
+"""Saved results as ``docs/benchmarks.md``, with plots of the distributions."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from benchmarks.contestants import CONTESTANTS
+from benchmarks.figures import METRICS
+from benchmarks.results import Results, Turn
+from benchmarks.tables import describe, rows
+from benchmarks.targets import judge
+
+__all__ = ["write_plots", "write_report"]
+
+POINTS = 400
+"""Points of a curve: close enough to the samples, and a plot that can still be mailed."""
+
+INTRODUCTION = """\
+# Benchmarks
+
+Written by `python -m benchmarks report`; do not edit.
+
+Contestants alternate in rounds within one run, each in a process of its own, which is set up for a
+turn and taken down after it. Latencies are taken around each call by the caller's own clock: the
+99th and 99.9th percentile are of all rounds' calls together, every other figure is the median over
+the rounds. CPU time and context switches are those of the whole process, middleware threads
+included. A ratio is taken in each round, and given as the median over the rounds with the lowest
+and the highest. The times belong to the machine below; the ratios travel better.
+"""
+
+
+def write_report(results: Results, out: Path) -> Path:
+    """Writes the page and its plots under `out`, and returns the page."""
+    page = out / "benchmarks.md"
+    out.mkdir(parents=True, exist_ok=True)
+    sections = [INTRODUCTION, *_machine(results), *_targets(results)]
+    plots = write_plots(results, out / "benchmarks")
+    for scenario in results.scenarios:
+        if not results.contestants(scenario):
+            continue
+        heading, body = rows(results, scenario)
+        what = describe(results.scenarios[scenario])
+        sections += [f"## {_title(scenario)}\n\n{_sentence(what)}\n", _markdown(heading, body)]
+        if scenario in plots:
+            picture = plots[scenario].relative_to(out)
+            sections.append(f"![{scenario}]({picture})\n")
+    page.write_text("\n".join(sections))
+    return page
+
+
+def write_plots(results: Results, folder: Path) -> dict[str, Path]:
+    """Draws a scenario's turns, as PNG and SVG; returns the SVG of each that has any."""
+    matplotlib.use("agg")
+    matplotlib.rcParams["svg.hashsalt"] = "rosasync"
+    folder.mkdir(parents=True, exist_ok=True)
+    plots = {}
+    for scenario, settings in results.scenarios.items():
+        contestants = {
+            key: [turn for turn in turns if turn.outcome == "ok"]
+            for key, turns in results.contestants(scenario).items()
+        }
+        contestants = {key: turns for key, turns in contestants.items() if turns}
+        if not contestants:
+            continue
+        figure = _draw(scenario, settings["metric"], contestants)
+        path = folder / (re.sub(r"\W+", "-", scenario) + ".svg")
+        figure.savefig(path, metadata={"Date": None})
+        figure.savefig(path.with_suffix(".png"), dpi=120)
+        plots[scenario] = path
+    return plots
+
+
+def _draw(scenario: str, metric: str, contestants: dict[str, list[Turn]]) -> Figure:
+    height = 1.6 + 0.34 * len(contestants)
+    sampled = any(turn.samples for turns in contestants.values() for turn in turns)
+    figure = Figure(figsize=(11, height if not sampled else max(height, 4.5)), layout="tight")
+    if metric == "median" or not sampled:
+        axes = list(figure.subplots(1, 2 if sampled else 1, squeeze=False)[0])
+    else:
+        axes = list(figure.subplots(1, 3)[:])
+        _rounds(axes.pop(), metric, contestants)
+    if sampled:
+        _spread(axes[0], contestants)
+        _exceeding(axes[1], contestants)
+    else:
+        _rounds(axes[0], metric, contestants)
+    figure.suptitle(_title(scenario))
+    return figure
+
+
+def _spread(axes: Axes, contestants: dict[str, list[Turn]]) -> None:
+    """The middle of each distribution: quartiles, median, and the 1st to the 99th percentile."""
+    samples = [_pooled(turns) for turns in contestants.values()]
+    boxes = axes.boxplot(
+        samples,
+        orientation="horizontal",
+        whis=(1, 99),
+        showfliers=False,
+        widths=0.6,
+        patch_artist=True,
+        medianprops={"color": "black"},
+    )
+    for i, box in enumerate(boxes["boxes"]):
+        box.set_facecolor(_color(i))
+    _name_rows(axes, contestants)
+    axes.set_xscale("log")
+    axes.set_xlabel("latency in µs: quartiles, 1 % to 99 %")
+
+
+def _exceeding(axes: Axes, contestants: dict[str, list[Turn]]) -> None:
+    """How many calls took longer than a time: the whole distribution, its tail drawn out."""
+    for i, turns in enumerate(contestants.values()):
+        samples = np.sort(_pooled(turns))
+        longer = np.unique(np.geomspace(1, len(samples), POINTS).astype(int))
+        axes.plot(samples[-longer], longer / len(samples), color=_color(i), linewidth=1.2)
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_xlabel("latency in µs")
+    axes.set_ylabel("share of calls that took longer")
+    axes.grid(alpha=0.3)
+
+
+def _rounds(axes: Axes, metric: str, contestants: dict[str, list[Turn]]) -> None:
+    """One dot for each round."""
+    figure = METRICS[metric]
+    for i, turns in enumerate(contestants.values()):
+        values = [value for turn in turns if (value := figure.of(turn)) is not None]
+        axes.plot(values, [i + 1] * len(values), "o", alpha=0.7, color=_color(i))
+    _name_rows(axes, contestants)
+    axes.set_xlim(left=min(0.0, axes.get_xlim()[0]))
+    axes.set_xlabel(f"{figure.label}, a dot for each round")
+
+
+def _name_rows(axes: Axes, contestants: Iterable[str]) -> None:
+    """Names the rows in the colours of the curves beside them, which so need no legend."""
+    names = list(contestants)
+    axes.set_yticks(range(1, len(names) + 1), names)
+    for i, label in enumerate(axes.get_yticklabels()):
+        label.set_color(_color(i))
+    axes.set_ylim(len(names) + 0.5, 0.5)
+    axes.grid(axis="x", alpha=0.3)
+
+
+def _color(i: int) -> Any:
+    """Ten strong colours, then the same ten lighter."""
+    return matplotlib.colormaps["tab20"](2 * i % 20 + i // 10 % 2)
+
+
+def _pooled(turns: Iterable[Turn]) -> list[float]:
+    return [sample / 1e3 for turn in turns for sample in turn.samples]
+
+
+def _machine(results: Results) -> Iterator[str]:
+    machine, settings = results.machine, results.settings
+    versions = ", ".join(f"{name} {version}" for name, version in machine["versions"].items())
+    yield "## Machine\n"
+    yield (
+        f"{machine['cpu']}, {machine['cores']} cores, load {machine['load']:.1f} before the run, "
+        f"Linux {machine['kernel']}, Python {machine['python']}, {machine['middleware']}; "
+        f"{versions}. {settings['rounds']} rounds{', quick' if settings['quick'] else ''}"
+        f"{', the server on cores of its own' if settings['pin'] else ''}.\n"
+    )
+    yield "## Contestants\n"
+    used = {turn.contestant for turn in results.turns}
+    body = [
+        [f"`{key}`", entry.label, "yes" if entry.spins else ""]
+        for key, entry in CONTESTANTS.items()
+        if key in used
+    ]
+    yield _markdown(["", "", "burns a core"], body)
+
+
+def _targets(results: Results) -> Iterator[str]:
+    body = [
+        [verdict.target.name, f"{verdict.target.sense} {verdict.target.bound:.2f}", verdict.text]
+        for verdict in judge(results)
+    ]
+    if body:
+        yield "## Targets\n"
+        yield _markdown(["", "target", "outcome"], body)
+
+
+def _markdown(heading: list[str], body: list[list[str]]) -> str:
+    lines = [heading, ["---"] * len(heading), *body]
+    cells = ([cell.replace("|", "\\|") for cell in line] for line in lines)
+    return "\n".join(f"| {' | '.join(line)} |" for line in cells) + "\n"
+
+
+def _title(scenario: str) -> str:
+    return scenario[0].upper() + scenario[1:]
+
+
+def _sentence(text: str) -> str:
+    return f"{_title(text)}."

@@ -1,0 +1,197 @@
+"""The server process of the benchmarks, asked by the runner: stock rclpy, or a bare loop.
+
+Services come and go with each turn, so that a contestant meets a server that has nothing else to
+do.
+"""
+
+from __future__ import annotations
+
+import heapq
+import os
+import select
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from contextlib import ExitStack
+from typing import Any
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
+
+from benchmarks.contestants.base import spinning
+from benchmarks.loop_server import signal_requests
+from benchmarks.meter import usage
+from benchmarks.pipes import answer_lines
+from benchmarks.work import Work, load_type, make_handler, make_qos, make_response
+
+LEAN_DEPTH = 1000
+WAIT_SET_LIMIT = 16
+"""Services from which on building the wait set would be most of the server's work."""
+
+
+class Lean(ABC):
+    """A bare loop in a thread: waits, takes requests and answers them when they are due."""
+
+    def __init__(self, node: Any, work: Work) -> None:
+        self._node = node
+        self._work = work
+        srv_type = load_type(work.srv_type)
+        qos = make_qos(work.depth or LEAN_DEPTH)
+        nothing = make_handler(work)
+        self.services = [
+            node.create_service(srv_type, name, nothing, qos_profile=qos).handle
+            for name in work.names
+        ]
+        self._request_type = srv_type.Request
+        self._response = make_response(work)
+        self._due: list[tuple[float, int, int, Any]] = []
+        self._taken = 0
+        self._ending = False
+        self._thread = threading.Thread(target=self._loop)
+
+    @abstractmethod
+    def wait(self, seconds: float | None) -> Iterable[int]:
+        """The services with requests, as soon as there are any, or none after `seconds`."""
+
+    @abstractmethod
+    def wake(self) -> None:
+        """Ends a wait from another thread."""
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def close(self) -> None:
+        self._ending = True
+        self.wake()
+        self._thread.join()
+        self._node.destroy_node()
+        rclpy.shutdown()
+
+    def _loop(self) -> None:
+        while not self._ending:
+            left = max(0.0, self._due[0][0] - time.monotonic()) if self._due else None
+            for service in self.wait(left):
+                self._take(service)
+            while self._due and self._due[0][0] <= time.monotonic():
+                _, _, service, header = heapq.heappop(self._due)
+                self.services[service].service_send_response(self._response, header)
+
+    def _take(self, service: int) -> None:
+        handle = self.services[service]
+        delay = self._work.delay(service)
+        while (taken := handle.service_take_request(self._request_type))[0] is not None:
+            header = taken[1].request_id
+            if delay:
+                self._taken += 1
+                due = (time.monotonic() + delay, self._taken, service, header)
+                heapq.heappush(self._due, due)
+            else:
+                handle.service_send_response(self._response, header)
+
+
+class WaitSetServer(Lean):
+    """Sleeps in one wait set, made once."""
+
+    def __init__(self, node: Any, work: Work) -> None:
+        super().__init__(node, work)
+        context = node.context.handle
+        self._guard = _rclpy.GuardCondition(context)
+        self._wait_set = _rclpy.WaitSet(0, 1, 0, 0, len(self.services), 0, context)
+
+    def wait(self, seconds: float | None) -> Iterable[int]:
+        self._wait_set.clear_entities()
+        self._wait_set.add_guard_condition(self._guard)
+        for handle in self.services:
+            self._wait_set.add_service(handle)
+        self._wait_set.wait(-1 if seconds is None else round(seconds * 1e9))
+        ready = self._wait_set.get_ready_entities("service")
+        return [i for i, handle in enumerate(self.services) if handle.pointer in ready]
+
+    def wake(self) -> None:
+        self._guard.trigger_guard_condition()
+
+    def close(self) -> None:
+        super().close()
+        self._wait_set.destroy_when_not_in_use()
+        self._guard.destroy_when_not_in_use()
+
+
+class EventServer(Lean):
+    """Sleeps on an eventfd for each service, which the middleware signals: for many services."""
+
+    def __init__(self, node: Any, work: Work) -> None:
+        super().__init__(node, work)
+        self._epoll = select.epoll()
+        self._of: dict[int, int] = {}
+        self._wake = self._watch(None)
+        for service, handle in enumerate(self.services):
+            signal_requests(handle, self._watch(service))
+
+    def wait(self, seconds: float | None) -> Iterable[int]:
+        for fd, _ in self._epoll.poll(seconds):
+            os.eventfd_read(fd)
+            if fd != self._wake:
+                yield self._of[fd]
+
+    def wake(self) -> None:
+        os.eventfd_write(self._wake, 1)
+
+    def close(self) -> None:
+        for handle in self.services:
+            signal_requests(handle, None)
+        super().close()
+        for fd in (self._wake, *self._of):
+            os.close(fd)
+        self._epoll.close()
+
+    def _watch(self, service: int | None) -> int:
+        fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        self._epoll.register(fd, select.EPOLLIN)
+        if service is not None:
+            self._of[fd] = service
+        return fd
+
+
+class Server:
+    """What the runner may ask for: ``serve``, ``usage``, ``end``."""
+
+    def __init__(self) -> None:
+        self._stack = ExitStack()
+
+    def answer(self, message: dict[str, Any]) -> dict[str, Any]:
+        answer: dict[str, Any] = getattr(self, "do_" + message.pop("do"))(**message)
+        return answer
+
+    def do_serve(self, work: dict[str, Any]) -> dict[str, Any]:
+        self._serve(Work.from_json(work))
+        return {}
+
+    def do_usage(self) -> dict[str, Any]:
+        return usage().to_json()
+
+    def do_end(self) -> dict[str, Any]:
+        self._stack.close()
+        return {}
+
+    def _serve(self, work: Work) -> None:
+        rclpy.init()
+        node = rclpy.create_node("bench_server")
+        if work.server == "lean":
+            lean = (EventServer if work.services > WAIT_SET_LIMIT else WaitSetServer)(node, work)
+            lean.start()
+            self._stack.callback(lean.close)
+            return
+        if any(work.delays):
+            raise ValueError("the stock server answers at once: a delay would block its executor")
+        srv_type, qos, handler = load_type(work.srv_type), make_qos(work.depth), make_handler(work)
+        for name in work.names:
+            node.create_service(srv_type, name, handler, qos_profile=qos)
+        self._stack.enter_context(spinning(node, SingleThreadedExecutor()))
+
+
+if __name__ == "__main__":
+    server = Server()
+    answer_lines(server.answer)
+    server.do_end()

@@ -1,0 +1,114 @@
+"""Results as tables, in the terminal and in Markdown."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from typing import Any
+
+from rich.box import SIMPLE
+from rich.table import Table
+
+from benchmarks.figures import METRICS, brief, figure, pooled_percentile, ratio
+from benchmarks.results import Results, Turn
+from benchmarks.targets import judge
+
+__all__ = ["describe", "rows", "scenario_table", "target_table"]
+
+COLUMNS = {
+    "median": ("median", "p99", "p99.9", "rate", "client_cpu", "server_cpu", "switches"),
+    "rate": ("rate", "median", "p99", "p99.9", "client_cpu", "server_cpu", "switches"),
+    "share": ("share",),
+    "growth": ("growth",),
+}
+POOLED = {"p99": 99.0, "p99.9": 99.9}
+BASELINES = {"call": "÷ call", "floor": "÷ floor"}
+
+
+def describe(scenario: dict[str, Any]) -> str:
+    """What a scenario is, in one line."""
+    work = scenario["work"]
+    if scenario["action"] == "rest":
+        return (
+            f"{work['idle_clients'] or 'one'} client(s), nothing called, {scenario['seconds']:g} s"
+        )
+    if scenario["action"] == "soak":
+        return "a third of the calls each answered, timed out and cancelled"
+    server = {"inside": "in the same process", "stock": "stock rclpy", "lean": "bare loop"}
+    parts = [f"server: {server[work['server']]}", f"callers: {scenario['callers']}"]
+    parts += [f"services: {work['services']}"] * (work["services"] > 1)
+    parts += [f"idle clients: {work['idle_clients']}"] * (work["idle_clients"] > 0)
+    parts += [f"payload: {work['payload']} bytes"] * (work["payload"] > 0)
+    parts += [f"answers after {work['delays'][0] * 1e3:g} ms"] * (work["delays"][0] > 0)
+    parts += [f"depth {work['depth']}"] if work["depth"] else []
+    return ", ".join(parts)
+
+
+def rows(results: Results, scenario: str) -> tuple[list[str], list[list[str]]]:
+    """A heading and the rows of one scenario, a row for each contestant."""
+    metric = results.scenarios[scenario]["metric"]
+    contestants = results.contestants(scenario)
+    baselines = {key: label for key, label in BASELINES.items() if key in contestants}
+    heading = [METRICS[name].label for name in COLUMNS[metric]]
+    table = []
+    for key, turns in contestants.items():
+        ratios = [ratio(turns, contestants[base], metric) for base in baselines]
+        table.append(
+            [
+                key,
+                *(_cell(turns, column) for column in COLUMNS[metric]),
+                *(str(found) if found else "" for found in ratios),
+                _remarks(turns),
+            ]
+        )
+    return ["", *heading, *baselines.values(), "remarks"], table
+
+
+def scenario_table(results: Results, scenario: str) -> Table:
+    heading, body = rows(results, scenario)
+    what = describe(results.scenarios[scenario])
+    table = Table(title=f"[bold]{scenario}[/]: {what}", title_justify="left", box=SIMPLE)
+    for i, column in enumerate(heading):
+        words = i in (0, len(heading) - 1)
+        table.add_column(column, justify="left" if words else "right", no_wrap=not words or i == 0)
+    for row in body:
+        table.add_row(*row)
+    return table
+
+
+def target_table(results: Results) -> Table | None:
+    """How the targets came out, or None where none was measured."""
+    verdicts = list(judge(results))
+    if not verdicts:
+        return None
+    table = Table(title="[bold]targets[/]", title_justify="left", box=SIMPLE)
+    for column in ("", "bound", "outcome"):
+        table.add_column(column)
+    style = {True: "green", False: "red", None: "yellow"}
+    for verdict in verdicts:
+        bound = f"{verdict.target.sense} {verdict.target.bound:.2f}"
+        table.add_row(verdict.target.name, bound, verdict.text, style=style[verdict.met])
+    return table
+
+
+def _cell(turns: Iterable[Turn], metric: str) -> str:
+    pooled = POOLED.get(metric)
+    value = pooled_percentile(turns, pooled) if pooled else figure(turns, metric)
+    if value is None:
+        return ""
+    return brief(value)
+
+
+def _remarks(turns: list[Turn]) -> str:
+    outcomes = Counter(turn.outcome for turn in turns)
+    lost, failed = sum(turn.lost for turn in turns), sum(turn.failed for turn in turns)
+    calls = lost + failed + sum(len(turn.samples) for turn in turns)
+    remarks = [
+        f"{outcome} {outcomes[outcome]} of {len(turns)} rounds"
+        for outcome in ("hung", "failed")
+        if outcomes[outcome]
+    ]
+    remarks += [f"lost {lost:,} of {calls:,}"] if lost else []
+    remarks += [f"failed {failed:,} of {calls:,}"] if failed else []
+    problems = dict.fromkeys(text for turn in turns for text in (turn.error, turn.problem) if text)
+    return "; ".join(remarks + list(problems)[:1])

@@ -1,0 +1,105 @@
+"""What a contestant is asked to do, and the requests, responses and handlers that go with it."""
+
+from __future__ import annotations
+
+import array
+import dataclasses
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+__all__ = [
+    "CALL_TIMEOUT",
+    "READY_TIMEOUT",
+    "Work",
+    "load_type",
+    "make_handler",
+    "make_qos",
+    "make_request",
+    "make_response",
+]
+
+CALL_TIMEOUT = 2.0
+"""Seconds after which a call counts as lost, where the contestant has deadlines at all."""
+
+READY_TIMEOUT = 30.0
+"""Seconds a contestant may take to find its servers."""
+
+
+@dataclass(frozen=True)
+class Work:
+    """One kind of call.
+
+    Attributes:
+        srv_type: the service type by name.
+        payload: bytes in the request (SetCameraInfo) or in the response (GetMap).
+        delays: seconds a server takes to answer; service ``i`` has the ``i``-th, cyclically.
+        services: how many services the calls go to, in turn.
+        idle_clients: clients that are there and never used.
+        depth: history depth of clients and servers; None for what each has by default.
+        server: ``stock``, an rclpy service on a SingleThreadedExecutor; ``lean``, a bare loop that
+            is not the bottleneck; ``inside``, in the contestant's own process, made by itself.
+        srv_name: what all services of this work begin with; the runner gives each turn its own.
+    """
+
+    srv_type: str = "std_srvs/srv/Empty"
+    payload: int = 0
+    delays: tuple[float, ...] = (0.0,)
+    services: int = 1
+    idle_clients: int = 0
+    depth: int | None = None
+    server: Literal["stock", "lean", "inside"] = "stock"
+    srv_name: str = "/bench"
+
+    @classmethod
+    def from_json(cls, data: dict[str, Any]) -> Work:
+        return cls(**{**data, "delays": tuple(data["delays"])})
+
+    def to_json(self) -> dict[str, Any]:
+        return dataclasses.asdict(self)
+
+    @property
+    def names(self) -> list[str]:
+        return [f"{self.srv_name}/service_{i}" for i in range(self.services)]
+
+    @property
+    def idle_names(self) -> list[str]:
+        return [f"{self.srv_name}/idle_{i}" for i in range(self.idle_clients)]
+
+    def delay(self, service: int) -> float:
+        return self.delays[service % len(self.delays)]
+
+
+def load_type(name: str) -> Any:
+    package, kind, type_name = name.split("/")
+    return getattr(importlib.import_module(f"{package}.{kind}"), type_name)
+
+
+def make_request(work: Work) -> Any:
+    request = load_type(work.srv_type).Request()
+    if work.srv_type == "sensor_msgs/srv/SetCameraInfo":
+        request.camera_info.d = array.array("d", bytes(work.payload))
+    return request
+
+
+def make_response(work: Work) -> Any:
+    response = load_type(work.srv_type).Response()
+    if work.srv_type == "nav_msgs/srv/GetMap":
+        response.map.data = array.array("b", bytes(work.payload))
+    return response
+
+
+def make_handler(work: Work) -> Callable[[Any, Any], Any]:
+    """A service callback, for the servers a contestant makes in its own process."""
+    prepared = make_response(work)
+    return lambda _request, _response: prepared
+
+
+def make_qos(depth: int | None) -> Any:
+    """The stock service QoS, with another depth where one is asked for."""
+    from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_services_default
+
+    if depth is None:
+        return qos_profile_services_default
+    return QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE)

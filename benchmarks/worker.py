@@ -1,0 +1,71 @@
+"""The process of one contestant, asked by the runner: ``python -m benchmarks.worker KEY``."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any, cast
+
+from benchmarks.contestants import Contestant, Tally, make_contestant
+from benchmarks.contestants.base import Soaking
+from benchmarks.meter import Usage, resident_bytes, usage
+from benchmarks.pipes import answer_lines
+from benchmarks.work import Work
+
+SOAK_STATES = (10_000, 100_000)
+"""The calls after which the memory is looked at."""
+
+
+class Worker:
+    def __init__(self, key: str) -> None:
+        self._contestant: Contestant = make_contestant(key)
+
+    def answer(self, message: dict[str, Any]) -> dict[str, Any]:
+        answer: dict[str, Any] = getattr(self, "do_" + message.pop("do"))(**message)
+        return answer
+
+    def do_setup(self, work: dict[str, Any]) -> dict[str, Any]:
+        self._contestant.setup(Work.from_json(work))
+        return {}
+
+    def do_call(self, callers: int, calls: int, seconds: float) -> dict[str, Any]:
+        before = usage()
+        if callers == 1:
+            tally = self._contestant.one_at_a_time(calls, seconds)
+        else:
+            tally = self._contestant.at_once(callers, calls, seconds)
+        return _result(tally, usage() - before)
+
+    def do_rest(self, seconds: float) -> dict[str, Any]:
+        before = usage()
+        tally = Tally()
+        with tally.timed():
+            self._contestant.rest(seconds)
+        return _result(tally, usage() - before)
+
+    def do_soak(self) -> dict[str, Any]:
+        before, done = usage(), 0
+        tally, memory = Tally(), []
+        for calls in SOAK_STATES:
+            tally = cast(Soaking, self._contestant).soak(calls - done)
+            done = calls
+            memory.append(resident_bytes())
+        return {**_result(tally, usage() - before), "memory": memory}
+
+    def do_close(self) -> dict[str, Any]:
+        self._contestant.close()
+        return {}
+
+
+def _result(tally: Tally, used: Usage) -> dict[str, Any]:
+    return {
+        "samples": tally.samples,
+        "elapsed": tally.elapsed,
+        "lost": tally.lost,
+        "failed": tally.failed,
+        "problem": tally.error,
+        "client": used.to_json(),
+    }
+
+
+if __name__ == "__main__":
+    answer_lines(Worker(sys.argv[1]).answer)
