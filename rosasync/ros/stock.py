@@ -17,7 +17,7 @@ from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 
-__all__ = ["READY", "Echo", "ThreadedClient", "answer_of", "request_for", "serve"]
+__all__ = ["READY", "ThreadedClient", "answer_of", "request_for", "serve"]
 
 READY = b"ready\n"
 """What the server process writes to its standard output once its services are there."""
