@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import asyncio
-import os
+import sys
+from collections.abc import Callable
 from typing import Any
 
 from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 
-from rosasync.ros.ports import Deliver
+from rosasync.ros.busy_poll import BusyPoll
+from rosasync.ros.ports import Deliver, DeliverRequest, RequestHeader
 from rosasync.ros.rcl import Rcl
+from rosasync.ros.services import has_clients, make_service, qos_of, send_response, take_requests
+from rosasync.ros.signals import Signal, Signals
 
 __all__ = ["DirectBridge", "Reserved"]
-
-SIGNALS = 16
-"""Most eventfds of a session: enough to tell its clients apart, few enough to have always."""
 
 
 class Reserved(CallbackGroup):  # type: ignore[misc]
@@ -37,38 +38,50 @@ class Reserved(CallbackGroup):  # type: ignore[misc]
 
 
 class DirectBridge:
-    """Takes responses on the loop's thread, when the middleware says that there are some."""
+    """Takes responses and requests on the loop's thread, when the middleware says so."""
 
     name = "direct"
 
-    def __init__(self, node: Node, rcl: Rcl, loop: asyncio.AbstractEventLoop) -> None:
+    def __init__(
+        self,
+        node: Node,
+        rcl: Rcl,
+        loop: asyncio.AbstractEventLoop,
+        configure: Callable[[Any], None],
+        busy_poll: float,
+    ) -> None:
         self._node = node
+        self._configure = configure
         self._rcl = rcl
-        self._loop = loop
         self._group = Reserved()
-        self._signals: list[_Signal] = []
+        self._clients: Signals[DirectClient] = Signals(loop, _take_responses)
+        self._services: Signals[DirectService] = Signals(loop, _take_requests)
+        self._poll = BusyPoll(loop, busy_poll) if busy_poll else None
 
     def open_client(self, srv_type: Any, srv_name: str, qos: Any, deliver: Deliver) -> DirectClient:
         """Make a client whose responses go to ``deliver``, on the loop's thread."""
         client = self._node.create_client(
             srv_type, srv_name, qos_profile=qos, callback_group=self._group
         )
-        return DirectClient(self._node, client, self._rcl, self._signal(), deliver)
+        self._configure(client)
+        return DirectClient(self._node, client, self._rcl, self._clients, self._poll, deliver)
+
+    def open_service(
+        self, srv_type: Any, srv_name: str, qos: Any, deliver: DeliverRequest
+    ) -> DirectService:
+        """Make a service whose requests go to ``deliver``, on the loop's thread."""
+        service = make_service(self._node, srv_type, srv_name, _nothing, qos, self._group)
+        self._configure(service)
+        return DirectService(self._node, service, self._rcl, self._services, deliver)
 
     def close(self) -> None:
-        """Destroy the clients that are left, then close the eventfds."""
-        for signal in self._signals:
-            for client in tuple(signal.clients):
-                client.close()
-            signal.close()
-        self._signals.clear()
-
-    def _signal(self) -> _Signal:
-        free = min(self._signals, key=lambda signal: len(signal.clients), default=None)
-        if free is None or (free.clients and len(self._signals) < SIGNALS):
-            free = _Signal(self._loop)
-            self._signals.append(free)
-        return free
+        """Destroy the clients and services that are left, then close the eventfds."""
+        for client in self._clients.members:
+            client.close()
+        self._clients.close()
+        for service in self._services.members:
+            service.close()
+        self._services.close()
 
 
 class DirectClient:
@@ -79,23 +92,34 @@ class DirectClient:
         "_deliver",
         "_node",
         "_out",
+        "_poll",
         "_rcl",
         "_response_type",
         "_signal",
         "_signalling",
+        "_signals",
         "_take",
         "handle",
+        "quick",
         "ready",
         "send_request",
     )
 
     def __init__(
-        self, node: Node, client: Any, rcl: Rcl, signal: _Signal, deliver: Deliver
+        self,
+        node: Node,
+        client: Any,
+        rcl: Rcl,
+        signals: Signals[DirectClient],
+        poll: BusyPoll | None,
+        deliver: Deliver,
     ) -> None:
         self._node = node
         self._client = client
         self._rcl = rcl
-        self._signal = signal
+        self._signals = signals
+        self._signal = signals.join(self)
+        self._poll = poll
         self._deliver = deliver
         self.handle = client.handle
         self._response_type = client.srv_type.Response
@@ -103,9 +127,9 @@ class DirectClient:
         self.send_request = self.handle.send_request
         self.ready = self.handle.service_server_is_available
         self._take = self.handle.take_response
-        self._out: set[int] = set()
+        self._out: dict[int, float] = {}
         self._signalling = False
-        signal.clients[self] = None
+        self.quick = False
 
     @property
     def is_waiting(self) -> bool:
@@ -114,18 +138,21 @@ class DirectClient:
 
     def send(self, request: Any) -> int:
         """Send a request; its sequence number."""
-        if not self._signalling:
-            self._start_signalling()
+        if self.quick:
+            self.stop_signalling()
+        elif not self._signalling:
+            self.start_signalling()
         sequence_number: int = self.send_request(request)
         out = self._out
         if not out:
             self._signal.waiting[self] = None
-        out.add(sequence_number)
+        poll = self._poll
+        out[sequence_number] = 0.0 if poll is None else poll.sent(self)
         return sequence_number
 
     def forget(self, sequence_number: int) -> None:
         """Expect no response to this request any more."""
-        self._out.discard(sequence_number)
+        self._out.pop(sequence_number, None)
         if not self._out:
             self._signal.waiting.pop(self, None)
 
@@ -138,11 +165,17 @@ class DirectClient:
                 break
             taken += 1
             sequence_number = header.request_id.sequence_number
-            self._out.discard(sequence_number)
+            sent = self._out.pop(sequence_number, None)
+            if self._poll is not None and sent is not None:
+                self._poll.answered(self, sent)
             self._deliver(sequence_number, response)
         if not self._out:
             self._signal.waiting.pop(self, None)
         return taken
+
+    def take_all(self) -> None:
+        """Take responses until the queue seems empty."""
+        self.take(sys.maxsize)
 
     def drain(self, most: int) -> None:
         """Take ``most`` times, whatever comes.
@@ -161,49 +194,97 @@ class DirectClient:
 
     def close(self) -> None:
         """Destroy the rcl client; idempotent."""
-        self._signal.clients.pop(self, None)
-        self._signal.waiting.pop(self, None)
         self._out.clear()
         self.stop_signalling()
+        self._signals.leave(self, self._signal)
+        if self._poll is not None:
+            self._poll.leave(self)
         self._node.destroy_client(self._client)
 
-    def _start_signalling(self) -> None:
+    def start_signalling(self) -> None:
+        """Have responses wake the loop, those that have come already too."""
         if not self._rcl.signal_responses(self.handle, self._signal.fd):
             raise RuntimeError("the middleware does not support new-response callbacks")
         self._signalling = True
 
 
-class _Signal:
-    """An eventfd that some clients share, and who of them waits for a response."""
+class DirectService:
+    """A rcl service that the loop's thread takes from."""
 
-    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
-        self._loop = loop
-        self.fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-        self.clients: dict[DirectClient, None] = {}
-        self.waiting: dict[DirectClient, None] = {}
-        loop.add_reader(self.fd, self._on_signal)
+    def __init__(
+        self,
+        node: Node,
+        service: Any,
+        rcl: Rcl,
+        signals: Signals[DirectService],
+        deliver: DeliverRequest,
+    ) -> None:
+        self._node = node
+        self._rcl = rcl
+        self._signals = signals
+        self._signal = signals.join(self)
+        self._deliver = deliver
+        self.handle = service
+        self.qos = qos_of(service)
+        self._service = service.handle
+        self._request_type = service.srv_type.Request
+        self._take = self._service.service_take_request
+        self._send = self._service.service_send_response
+        self._closed = False
+        self._stopped = False
+        if not rcl.signal_requests(self._service, self._signal.fd):
+            self.close()
+            raise RuntimeError("the middleware does not support new-request callbacks")
+
+    def send(self, header: RequestHeader, response: Any) -> None:
+        """Convert and send a response."""
+        send_response(self._send, response, header.request_id)
+
+    def has_clients(self) -> bool:
+        """Tell whether the graph shows a client."""
+        return has_clients(self._node, self._service)
+
+    def take(self, most: int) -> None:
+        """Take ``most`` times, and only then deliver: the sooner the queue is empty, the better."""
+        for request, header in take_requests(self._take, self._request_type, most):
+            self._deliver(request, header)
+
+    def stop(self) -> None:
+        """Deliver no more requests; idempotent."""
+        if not self._stopped:
+            self._stopped = True
+            self._rcl.signal_requests(self._service, None)
+            self._signals.leave(self, self._signal)
 
     def close(self) -> None:
-        if not self._loop.is_closed():
-            self._loop.remove_reader(self.fd)
-        os.close(self.fd)
+        """Destroy the rcl service; idempotent."""
+        self.stop()
+        if not self._closed:
+            self._closed = True
+            self._node.destroy_service(self.handle)
 
-    def _on_signal(self) -> None:
-        """Take as many responses as were signalled, by the client that asked last first.
 
-        Usually each of them belongs to a client that waits for it. Where some are left over, they
-        were for other processes, and stand in any of the clients' queues: those that wait are
-        drained, the others taken off the signal.
-        """
-        try:
-            left = os.eventfd_read(self.fd)
-        except BlockingIOError:
+def _take_responses(signal: Signal[DirectClient], left: int) -> None:
+    """Take as many responses as were signalled, by the client that asked last first.
+
+    Usually each of them belongs to a client that waits for it. Where some are left over, they were
+    for other processes, and stand in any of the clients' queues: those that wait are drained, the
+    others taken off the signal.
+    """
+    for client in reversed(tuple(signal.waiting)):
+        left -= client.take(left)
+        if left <= 0:
             return
-        for client in reversed(tuple(self.waiting)):
-            left -= client.take(left)
-            if left <= 0:
-                return
-        for client in tuple(self.clients):
-            if not client.is_waiting:
-                client.stop_signalling()
-            client.drain(left)
+    for client in tuple(signal.members):
+        if not client.is_waiting:
+            client.stop_signalling()
+        client.drain(left)
+
+
+def _take_requests(signal: Signal[DirectService], signalled: int) -> None:
+    for service in tuple(signal.members):
+        service.take(signalled)
+
+
+def _nothing(request: object, response: object) -> None:
+    """Is never called: no executor takes from a service of the group `Reserved`."""

@@ -4,38 +4,59 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import weakref
+from collections.abc import Callable
 from typing import Any
 
-from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
+from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 
 from rosasync.errors import SessionClosed
 from rosasync.ros.executor import Mailbox
-from rosasync.ros.ports import Deliver
+from rosasync.ros.ports import Deliver, DeliverRequest, RequestHeader
+from rosasync.ros.services import has_clients, make_service, qos_of, send_response
 
 __all__ = ["ExecutorBridge"]
 
+BATCH = 100
+"""Most requests that the executor's thread takes at once."""
+
 
 class ExecutorBridge:
-    """Has the executor take the responses, and brings them to the loop by a mailbox."""
+    """Has the executor take responses and requests, and brings them to the loop by a mailbox."""
 
     name = "executor"
 
-    def __init__(self, node: Node, mailbox: Mailbox) -> None:
+    def __init__(self, node: Node, mailbox: Mailbox, configure: Callable[[Any], None]) -> None:
         self._node = node
+        self._configure = configure
         self._mailbox = mailbox
         # A group of their own, so that no other callback of the node holds the clients back.
         self._group = ReentrantCallbackGroup()
+        self._services: weakref.WeakSet[FutureService] = weakref.WeakSet()
 
     def open_client(self, srv_type: Any, srv_name: str, qos: Any, deliver: Deliver) -> FutureClient:
         """Make a client whose responses go to ``deliver``, on the loop's thread."""
         client = self._node.create_client(
             srv_type, srv_name, qos_profile=qos, callback_group=self._group
         )
+        self._configure(client)
         return FutureClient(self._node, client, self._mailbox, deliver)
 
+    def open_service(
+        self, srv_type: Any, srv_name: str, qos: Any, deliver: DeliverRequest
+    ) -> FutureService:
+        """Make a service whose requests go to ``deliver``, on the loop's thread."""
+        service = FutureService(self._node, self._mailbox, deliver)
+        service.open(srv_type, srv_name, qos, self._configure)
+        self._services.add(service)
+        return service
+
     def close(self) -> None:
-        """Nothing is held besides the clients."""
+        """Destroy the services that are left; nothing else is held."""
+        for service in tuple(self._services):
+            service.close()
 
 
 class FutureClient:
@@ -94,3 +115,89 @@ class _Completion:
 
     def __call__(self, future: Any) -> None:
         self._client.complete(self._number, future)
+
+
+class FutureService:
+    """A rclpy service whose requests the executor takes, and whose responses are ours to send.
+
+    The executor calls ``callback(request, response)`` and then
+    ``service.send_response(returned, header)``. So the callback returns the request, and
+    ``send_response``, replaced on this one service, takes it and its header to the loop. The
+    executor goes on at once, whenever the response will be sent.
+    """
+
+    def __init__(self, node: Node, mailbox: Mailbox, deliver: DeliverRequest) -> None:
+        self._node = node
+        self._mailbox = mailbox
+        self._deliver = deliver
+        # One at a time, so that requests keep their order in a MultiThreadedExecutor.
+        self._group = _Shut()
+        self._stopped = False
+        self._closed = False
+
+    def open(
+        self, srv_type: Any, srv_name: str, qos: Any, configure: Callable[[Any], None]
+    ) -> None:
+        """Create the service, and only then let an executor take from it."""
+        service = make_service(self._node, srv_type, srv_name, _request, qos, self._group)
+        configure(service)
+        self.handle = service
+        self.qos = qos_of(service)
+        self._request_type = srv_type.Request
+        self._take = service.handle.service_take_request
+        self._send = service.handle.service_send_response
+        service.send_response = self._taken
+        self._group.shut = False
+        if self._node.executor is not None:
+            self._node.executor.wake()
+
+    def send(self, header: RequestHeader, response: Any) -> None:
+        """Convert and send a response."""
+        send_response(self._send, response, header.request_id)
+
+    def has_clients(self) -> bool:
+        """Tell whether the graph shows a client."""
+        return has_clients(self._node, self.handle.handle)
+
+    def stop(self) -> None:
+        """Deliver no more requests; idempotent."""
+        self._stopped = True
+
+    def close(self) -> None:
+        """Destroy the rclpy service; idempotent."""
+        self._stopped = True
+        if not self._closed:
+            self._closed = True
+            self._node.destroy_service(self.handle)
+
+    def _taken(self, request: Any, header: Any) -> None:
+        """Take this request to the loop, and those behind it. Called on the executor's thread.
+
+        An executor that waits again before every request is too slow for its queue.
+        """
+        with contextlib.suppress(SessionClosed, InvalidHandle):
+            self._mailbox.post(self._arrived, request, header)
+            with self.handle.handle:
+                for _ in range(BATCH):
+                    request, header = self._take(self._request_type)
+                    if header is None:
+                        break
+                    self._mailbox.post(self._arrived, request, header)
+
+    def _arrived(self, request: Any, header: Any) -> None:
+        if not self._stopped:
+            self._deliver(request, header)
+
+
+class _Shut(MutuallyExclusiveCallbackGroup):  # type: ignore[misc]
+    """Keeps its service from every executor until it is opened."""
+
+    shut = True
+
+    def can_execute(self, entity: Any) -> bool:
+        """Tell whether an executor may take from the service now."""
+        return not self.shut and bool(super().can_execute(entity))
+
+
+def _request(request: Any, response: object) -> Any:
+    return request

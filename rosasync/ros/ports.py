@@ -5,10 +5,87 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable
 from typing import Any, Protocol
 
-__all__ = ["ClientPort", "Deliver", "NodePort"]
+__all__ = [
+    "ClientPort",
+    "Deliver",
+    "DeliverRequest",
+    "NodePort",
+    "RequestHeader",
+    "RequestId",
+    "ServicePort",
+    "Undeliverable",
+    "Unmatched",
+]
 
 Deliver = Callable[[int, Any], None]
 """Takes a sequence number and the response to it, on the loop's thread."""
+
+
+class Undeliverable(Exception):
+    """The middleware says that a response reaches nobody."""
+
+
+class Unmatched(Undeliverable):
+    """The client was just made: the way back to it is not there yet. To be sent again."""
+
+
+class RequestId(Protocol):
+    """Whose request it is, and which. Its client is in it, but not to be seen."""
+
+    @property
+    def sequence_number(self) -> int:
+        """The number its client gave it."""
+
+
+class RequestHeader(Protocol):
+    """What came with a request: to be kept as it is, for the response."""
+
+    @property
+    def request_id(self) -> RequestId:
+        """Where the response goes."""
+
+    @property
+    def source_timestamp(self) -> int:
+        """When the request was sent, in ns; 0 or less where that is unknown."""
+
+    @property
+    def received_timestamp(self) -> int:
+        """When it arrived, in ns; 0 or less where that is unknown."""
+
+
+DeliverRequest = Callable[[Any, RequestHeader], None]
+"""Takes a request and its header, on the loop's thread."""
+
+
+class ServicePort(Protocol):
+    """One rcl service. Every method returns at once, and is called on the loop's thread, but for
+    those that say otherwise.
+    """
+
+    @property
+    def handle(self) -> Any:
+        """The rclpy object."""
+
+    @property
+    def qos(self) -> Any:
+        """The QoS in use."""
+
+    def send(self, header: RequestHeader, response: Any) -> None:
+        """Convert and send a response. On any thread, but never during or after `close`.
+
+        Raises:
+            Undeliverable: the middleware says that it reaches nobody.
+            Unmatched: it reaches nobody yet.
+        """
+
+    def has_clients(self) -> bool:
+        """Tell whether the graph shows a client. On any thread, but not during `close`."""
+
+    def stop(self) -> None:
+        """Deliver no more requests; idempotent. Responses may still be sent."""
+
+    def close(self) -> None:
+        """Destroy the service; idempotent."""
 
 
 class ClientPort(Protocol):
@@ -60,6 +137,11 @@ class NodePort(Protocol):
 
     def open_client(self, srv_type: Any, srv_name: str, qos: Any, deliver: Deliver) -> ClientPort:
         """Make a client whose responses go to ``deliver``."""
+
+    def open_service(
+        self, srv_type: Any, srv_name: str, qos: Any, deliver: DeliverRequest
+    ) -> ServicePort:
+        """Make a service whose requests go to ``deliver``."""
 
     def servers(self, srv_name: str) -> int:
         """Return how many servers of this resolved name the graph shows, whatever their type."""

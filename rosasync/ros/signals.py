@@ -1,0 +1,89 @@
+"""Eventfds that the middleware writes to and the loop watches, shared by clients or services."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+__all__ = ["Signal", "Signals"]
+
+M = TypeVar("M")
+
+MOST = 16
+"""Most eventfds of a kind: enough to tell members apart, few enough to have always."""
+
+
+class Signal(Generic[M]):
+    """An eventfd, who shares it, and who of them waits for something."""
+
+    def __init__(
+        self, loop: asyncio.AbstractEventLoop, take: Callable[[Signal[M], int], None]
+    ) -> None:
+        self._loop = loop
+        self._take = take
+        self.fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self.members: dict[M, None] = {}
+        self.waiting: dict[M, None] = {}
+        loop.add_reader(self.fd, self._on_readable)
+
+    def close(self) -> None:
+        """Close the eventfd; nobody may write to it any more."""
+        if not self._loop.is_closed():
+            self._loop.remove_reader(self.fd)
+        os.close(self.fd)
+
+    def _on_readable(self) -> None:
+        try:
+            signalled = os.eventfd_read(self.fd)
+        except BlockingIOError:
+            return
+        self._take(self, signalled)
+
+
+class Signals(Generic[M]):
+    """Gives each member a signal to share with as few others as possible.
+
+    The first signal stays until the end, so that the number of descriptors depends on how many
+    members there are, not on how many there have been.
+
+    Args:
+        loop: the loop that watches.
+        take: called on its thread with a signal and how many events the middleware counted.
+    """
+
+    def __init__(
+        self, loop: asyncio.AbstractEventLoop, take: Callable[[Signal[M], int], None]
+    ) -> None:
+        self._loop = loop
+        self._take = take
+        self._signals: list[Signal[M]] = []
+
+    @property
+    def members(self) -> list[M]:
+        """Every member of every signal."""
+        return [member for signal in self._signals for member in signal.members]
+
+    def join(self, member: M) -> Signal[M]:
+        """Return the signal for a new member."""
+        signal = min(self._signals, key=lambda signal: len(signal.members), default=None)
+        if signal is None or (signal.members and len(self._signals) < MOST):
+            signal = Signal(self._loop, self._take)
+            self._signals.append(signal)
+        signal.members[member] = None
+        return signal
+
+    def leave(self, member: M, signal: Signal[M]) -> None:
+        """Let go of a member that the middleware signals nothing for any more; idempotent."""
+        signal.members.pop(member, None)
+        signal.waiting.pop(member, None)
+        if not signal.members and len(self._signals) > 1 and signal in self._signals:
+            self._signals.remove(signal)
+            signal.close()
+
+    def close(self) -> None:
+        """Close the eventfds; after the members left."""
+        for signal in self._signals:
+            signal.close()
+        self._signals.clear()
