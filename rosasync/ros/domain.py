@@ -8,6 +8,8 @@ import random
 import tempfile
 from pathlib import Path
 
+__all__ = ["isolate"]
+
 _claimed: list[int] = []
 
 

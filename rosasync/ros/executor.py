@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
+from rclpy.exceptions import InvalidHandle
 from rclpy.executors import Executor, ExternalShutdownException, ShutdownException
 
 from rosasync.errors import SessionClosed
@@ -83,13 +84,18 @@ class ExecutorThread:
 
     @property
     def ident(self) -> int | None:
-        """The thread's identifier, as ``threading.get_ident`` gives it."""
-        return self._thread.ident
+        """The thread's identifier, as ``threading.get_ident`` gives it; None once it has ended.
+
+        Another thread may have the same one then.
+        """
+        return self._thread.ident if self._thread.is_alive() else None
 
     def stop(self) -> None:
         """Ask the thread to end, after the callback under way. Any thread; idempotent."""
-        self._stopping.set()
-        self._executor.wake()
+        if not self._stopping.is_set():
+            self._stopping.set()
+            # After a `wake` alone, without work, the executor would wait again.
+            self._executor.create_task(_nothing)
 
     def join(self, timeout: float) -> bool:
         """Wait for the end, ``timeout`` seconds at the most; blocks.
@@ -105,13 +111,27 @@ class ExecutorThread:
     def _spin(self) -> None:
         while not self._stopping.is_set():
             try:
-                self._executor.spin_once()
+                # What `spin_once` does: apart here to tell its own errors from the callbacks'.
+                handler, _, _ = self._executor.wait_for_ready_callbacks()
             except (ExternalShutdownException, ShutdownException):
                 break
+            except InvalidHandle:
+                # An entity was destroyed while it was added to the wait set (rclpy issue 1355).
+                self._stopping.wait(0.001)
+                continue
             except Exception as error:
                 if self._stopping.is_set() or not self._executor.context.ok():
                     break
                 self._on_error(error)
+                self._stopping.wait(0.1)
+                continue
+            handler()
+            if handler.exception() is not None:
+                self._on_error(handler.exception())
         if not self._stopping.is_set():
             self._on_shutdown()
         self._on_end()
+
+
+def _nothing() -> None:
+    """A task to wake for."""

@@ -14,8 +14,10 @@ from rclpy.context import Context
 from rclpy.exceptions import InvalidServiceNameException, InvalidTopicNameException
 from rclpy.executors import Executor, SingleThreadedExecutor
 from rclpy.expand_topic_name import expand_topic_name
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, qos_profile_services_default
+from rclpy.qos import QoSProfile, qos_profile_services_default, qos_profile_system_default
+from rclpy.service_introspection import ServiceIntrospectionState
 from rclpy.signals import SignalHandlerOptions
 from rclpy.validate_full_topic_name import validate_full_topic_name
 
@@ -26,7 +28,7 @@ from rosasync.ros.executor import ExecutorThread, Mailbox
 from rosasync.ros.futures import ExecutorBridge
 from rosasync.ros.graph import GraphWaitable
 from rosasync.ros.messages import request_message, service_type, type_name
-from rosasync.ros.ports import ClientPort, Deliver
+from rosasync.ros.ports import ClientPort, Deliver, DeliverRequest, ServicePort
 
 __all__ = ["RosNode"]
 
@@ -52,6 +54,9 @@ class RosNode:
         bridge: ``"auto"``, ``"direct"`` or ``"executor"``.
         on_graph: called on the loop's thread at a change of the graph.
         on_shutdown: called on the loop's thread when the context goes down.
+        introspection: what clients and services publish of their calls: ``"off"``,
+            ``"metadata"`` or ``"contents"``.
+        busy_poll: seconds to look for a response before the loop sleeps; see `BusyPoll`.
     """
 
     def __init__(
@@ -62,16 +67,23 @@ class RosNode:
         bridge: Literal["auto", "direct", "executor"],
         on_graph: Callable[[], None],
         on_shutdown: Callable[[], None],
+        introspection: Literal["off", "metadata", "contents"] = "off",
+        busy_poll: float = 0.0,
     ) -> None:
+        if not isinstance(node, str | Node):
+            kind = type(node).__name__
+            raise TypeError(f"node must be a name or an rclpy.node.Node, not {kind}")
         self._loop = asyncio.get_running_loop()
         self._mailbox = Mailbox(self._loop)
         self._on_graph = on_graph
         self._on_shutdown = on_shutdown
+        self._introspection = introspection
         self._graph_pending = False
         self._thread: ExecutorThread | None = None
         self._thread_ended = asyncio.Event()
         self._own_context: Context | None = None
         self._own_executor: Executor | None = None
+        self._added = False
         self._owned = isinstance(node, str)
         self._waitable: GraphWaitable | None = None
         self._direct_rcl = rcl.load()
@@ -79,9 +91,9 @@ class RosNode:
         try:
             self.node = self._make_node(node, context) if isinstance(node, str) else node
             if executor is not None:
-                executor.add_node(self.node)
+                self._added = executor.add_node(self.node)
             foreign = self.node.executor
-            self._bridge = self._make_bridge(bridge, foreign)
+            self._bridge = self._make_bridge(bridge, foreign, busy_poll)
             if self._direct_rcl is not None and not _takes_callbacks(foreign):
                 self._waitable = GraphWaitable(self.node, self._direct_rcl, self._post_graph)
             self.node.context.on_shutdown(self._post_shutdown)
@@ -117,7 +129,7 @@ class RosNode:
         if qos is not None and not isinstance(qos, QoSProfile):
             raise TypeError(f"qos must be an rclpy QoSProfile, not {type(qos).__name__}")
         srv_class = service_type(srv_type)
-        return srv_class, type_name(srv_class), None if qos is None else repr(qos)
+        return srv_class, type_name(srv_class), None if qos is None else str(qos)
 
     def request(self, srv_type: Any, request: Any) -> Any:
         """Return a message of the request type."""
@@ -142,7 +154,22 @@ class RosNode:
     def open_client(self, srv_type: Any, srv_name: str, qos: Any, deliver: Deliver) -> ClientPort:
         """Make a client whose responses go to ``deliver``."""
         assert self._bridge is not None
-        return self._bridge.open_client(srv_type, srv_name, qos or default_qos(), deliver)
+        try:
+            return self._bridge.open_client(srv_type, srv_name, qos or default_qos(), deliver)
+        except rclpy_implementation.RCLError as error:
+            if "incompatible type" in str(error):
+                raise UsageError(
+                    f"{srv_name}: this process already has a client or server of this name with "
+                    f"another type than {type_name(srv_type)}, and the middleware allows but one"
+                ) from error
+            raise
+
+    def open_service(
+        self, srv_type: Any, srv_name: str, qos: Any, deliver: DeliverRequest
+    ) -> ServicePort:
+        """Make a service whose requests go to ``deliver``."""
+        assert self._bridge is not None
+        return self._bridge.open_service(srv_type, srv_name, qos or default_qos(), deliver)
 
     def servers(self, srv_name: str) -> int:
         """Return how many servers of this resolved name the graph shows, whatever their type."""
@@ -151,11 +178,11 @@ class RosNode:
 
     def provides(self, srv_type: str, srv_name: str) -> bool:
         """Tell whether the graph shows a server of this resolved name and type."""
-        return srv_type in self._services().get(srv_name, ())
+        return bool(self.servers(srv_name)) and srv_type in self._served().get(srv_name, ())
 
     def seen_instead(self, srv_type: str, srv_name: str) -> str:
         """Say, as a clause, what the graph shows where this service is missing."""
-        services = self._services()
+        services = self._served()
         servers = self.servers(srv_name)
         if types := services.get(srv_name):
             if srv_type in types:
@@ -200,17 +227,37 @@ class RosNode:
             self._waitable.close()
         if self._bridge is not None:
             self._bridge.close()
-        if self._own_executor is not None:
-            self._own_executor.remove_node(self.node)
+        if self._added:
             self.node.executor = None
+        if self._own_executor is not None:
             self._own_executor.shutdown()
         if self._owned and hasattr(self, "node"):
             self.node.destroy_node()
         if self._own_context is not None:
             self._own_context.try_shutdown()
 
-    def _services(self) -> dict[str, list[str]]:
-        return dict(self.node.get_service_names_and_types())
+    def _served(self) -> dict[str, set[str]]:
+        """Return the types of every service that has a server.
+
+        The graph lists a name with the types of those who serve it and of those who ask for it,
+        this session too. Where they differ, the nodes tell who serves what; that news may be some
+        milliseconds younger.
+        """
+        services: dict[str, set[str]] = {}
+        for srv_name, types in self.node.get_service_names_and_types():
+            if self.servers(srv_name):
+                known = self._served_by_nodes(srv_name) if len(types) > 1 else None
+                services[srv_name] = known or set(types)
+        return services
+
+    def _served_by_nodes(self, srv_name: str) -> set[str]:
+        types: set[str] = set()
+        for node in self.node.get_node_names_and_namespaces():
+            # A node may leave the graph meanwhile.
+            with contextlib.suppress(rclpy_implementation.NodeNameNonExistentError):
+                served = dict(self.node.get_service_names_and_types_by_node(*node))
+                types.update(served.get(srv_name, ()))
+        return types
 
     def _make_node(self, name: str, context: Context | None) -> Node:
         if context is None:
@@ -220,21 +267,31 @@ class RosNode:
             raise UsageError("the context is not initialised, or was shut down: rclpy.init() it")
         return Node(name, context=context)
 
-    def _make_bridge(self, bridge: str, executor: Executor | None) -> DirectBridge | ExecutorBridge:
+    def _make_bridge(
+        self, bridge: str, executor: Executor | None, busy_poll: float
+    ) -> DirectBridge | ExecutorBridge:
         tried = rclpy.get_rmw_implementation_identifier() in DIRECT_TRIED
         takes = _takes_callbacks(executor)
         if bridge == "direct" and (self._direct_rcl is None or takes):
             reason = "an EventsExecutor takes the responses" if takes else "librcl is out of reach"
             raise UsageError(f"bridge='direct' does not work here: {reason}")
-        if bridge == "executor" or self._direct_rcl is None or takes:
-            return ExecutorBridge(self.node, self._mailbox)
-        if bridge == "auto" and not tried:
-            return ExecutorBridge(self.node, self._mailbox)
-        return DirectBridge(self.node, self._direct_rcl, self._loop)
+        executor_only = self._direct_rcl is None or takes or (bridge == "auto" and not tried)
+        if bridge == "executor" or executor_only:
+            if busy_poll:
+                raise UsageError("busy_poll needs the direct bridge, which is not in use here")
+            return ExecutorBridge(self.node, self._mailbox, self._introspect)
+        assert self._direct_rcl is not None
+        return DirectBridge(self.node, self._direct_rcl, self._loop, self._introspect, busy_poll)
+
+    def _introspect(self, entity: Any) -> None:
+        """Have a client or service publish its calls, where that is wanted."""
+        if self._introspection != "off":
+            state = getattr(ServiceIntrospectionState, self._introspection.upper())
+            entity.configure_introspection(self.node.get_clock(), qos_profile_system_default, state)
 
     def _spin(self) -> None:
         self._own_executor = SingleThreadedExecutor(context=self.node.context)
-        self.node.executor = self._own_executor
+        self._added = self._own_executor.add_node(self.node)
         self._thread = ExecutorThread(
             self._own_executor,
             f"rosasync executor of {self.node.get_name()}",
