@@ -130,6 +130,11 @@ class Client:
         resend = None if retry is None else _Resend(self, request, future, retry, sequence_number)
         try:
             return await future
+        except asyncio.CancelledError:
+            # Answered, but its task was cancelled before it woke up.
+            if not future.cancelled() and future.exception() is None:
+                counts.late += 1
+            raise
         finally:
             counts.in_flight -= 1
             if timer is not None:

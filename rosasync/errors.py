@@ -12,7 +12,7 @@
         ├── ServiceUnavailable   (TimeoutError) no server
         ├── QueueTimeout         (TimeoutError) the deadline passed while waiting for a client
         ├── ResponseTimeout      (TimeoutError) sent, and not answered in time
-        └── ServerGone           (ConnectionError) the last server vanished while the request was out
+        └── ServerGone           (ConnectionError) the last server vanished, the request being out
 
 Besides these, a message of the wrong type is a ``TypeError`` and a value out of range a
 ``ValueError``, both before anything is sent.

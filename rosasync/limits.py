@@ -13,6 +13,7 @@ __all__ = [
     "Limits",
     "PoolStatistics",
     "Retry",
+    "ServerStatistics",
     "ServiceKey",
     "SessionStatistics",
 ]
@@ -182,13 +183,47 @@ class PoolStatistics(KeyStatistics):
 
 
 @dataclass(frozen=True, slots=True)
+class ServerStatistics:
+    """How a server stands: three figures of now, then what happened so far.
+
+    Attributes:
+        srv_name: the resolved name.
+        running: handlers under way.
+        waiting: requests that wait for one.
+        unanswered: requests taken and neither answered nor given up: running, waiting, deferred.
+        taken: requests taken out of the middleware.
+        responded: responses sent.
+        deferred: handlers that returned without having responded.
+        failed: handlers that raised, or returned something that is no response.
+        rejected: requests that came when ``backlog`` others waited, answered or not.
+        dropped: calls that never get an answer, for other reasons than a failed handler: past the
+            backlog, unanswered when nobody held them any more, or when the server ended.
+        undeliverable: responses that reached nobody, as far as can be seen.
+    """
+
+    srv_name: str
+    running: int = 0
+    waiting: int = 0
+    unanswered: int = 0
+    taken: int = 0
+    responded: int = 0
+    deferred: int = 0
+    failed: int = 0
+    rejected: int = 0
+    dropped: int = 0
+    undeliverable: int = 0
+
+
+@dataclass(frozen=True, slots=True)
 class SessionStatistics:
     """How a session stands.
 
     Attributes:
         bridge: ``"direct"`` or ``"executor"``.
         pool: what the pool's clients are doing.
+        servers: what the session's servers are doing, those that are not closed.
     """
 
     bridge: str
     pool: PoolStatistics
+    servers: tuple[ServerStatistics, ...] = ()

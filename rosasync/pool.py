@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 from collections import OrderedDict
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -17,6 +18,7 @@ from rosasync.errors import (
     PoolFull,
     QueueTimeout,
     ResponseTimeout,
+    RosasyncError,
     ServerGone,
     ServiceUnavailable,
     UsageError,
@@ -136,6 +138,7 @@ class ClientPool:
         self._node = node
         self._limits = limits
         self._timeout = timeout
+        self._opened = self._loop.time()
         self._endpoints: dict[ServiceKey, Endpoint] = {}
         self._shortcuts: dict[tuple[Any, str, Any], Endpoint] = {}
         self._graph = 0
@@ -206,11 +209,11 @@ class ClientPool:
         while len(endpoint.clients) < clients:
             self._open(endpoint)
             await asyncio.sleep(0)
-        patience = self._loop.time() + MATCHING
-        while self._provided(endpoint) and self._loop.time() < patience:
-            if all(self._is_matched(endpoint, client) for client in endpoint.clients):
-                break
-            await asyncio.sleep(FIRST_LOOK)
+        # A session that has just been opened does not know the graph yet.
+        since = self._loop.time() if self._provided(endpoint) else self._opened
+        with suppress(Expired):
+            for client in tuple(endpoint.clients):
+                await self._take_turn(endpoint, client, since + MATCHING)
 
     def statistics(self) -> PoolStatistics:
         """Take a snapshot of the pool, in all and for each service."""
@@ -233,7 +236,7 @@ class ClientPool:
         try:
             return self._shortcuts[shortcut]
         except (KeyError, TypeError):
-            self._check_open()
+            self.check_open()
         srv_class, type_name, qos_key = self._node.describe(srv_type, qos)
         key = ServiceKey(self._node.resolve(srv_name), type_name, qos_key)
         endpoint = self._endpoints.get(key)
@@ -297,7 +300,7 @@ class ClientPool:
 
     def is_ready(self, endpoint: Endpoint) -> bool:
         """Tell whether a client of this service is matched with a server."""
-        self._check_open()
+        self.check_open()
         if not endpoint.clients:
             self._open(endpoint)
         if self._look_timer is None:
@@ -313,9 +316,9 @@ class ClientPool:
 
     def end(self, ending: Callable[[], Exception]) -> None:
         """End every call with the error ``ending`` makes, and destroy the clients; idempotent."""
-        if self._ending is not None:
+        ended, self._ending = self._ending is not None, ending
+        if ended:
             return
-        self._ending = ending
         for timer in (self._look_timer, self._evict_timer):
             if timer is not None:
                 timer.cancel()
@@ -350,7 +353,7 @@ class ClientPool:
         started = self._loop.time()
         deadline = None if seconds is None else started + seconds
         try:
-            self._check_open()
+            self.check_open()
             try:
                 await self._take_turn(endpoint, client, deadline)
             except Expired:
@@ -414,7 +417,7 @@ class ClientPool:
             Expired: the deadline passed.
             PoolFull: the line is as long as allowed.
         """
-        self._check_open()
+        self.check_open()
         waiter: asyncio.Future[Client] = self._loop.create_future()
         endpoint.waiters[waiter] = None
         self._serve_line(endpoint)
@@ -445,7 +448,7 @@ class ClientPool:
             ServiceUnavailable: there is no server, and ``wait`` is False or the deadline passed.
             QueueTimeout: there is one, but no client became free.
         """
-        self._check_open()
+        self.check_open()
         if not wait and not self.is_ready(endpoint):
             if not self._provided(endpoint):
                 raise self._unavailable(endpoint, self._loop.time() - started)
@@ -484,6 +487,7 @@ class ClientPool:
         finally:
             if timer is not None:
                 timer.cancel()
+            self._evict_later()
 
     def _release(self, endpoint: Endpoint, client: Client) -> None:
         client.leases -= 1
@@ -492,15 +496,16 @@ class ClientPool:
         if endpoint.waiters:
             self._serve_line(endpoint)
         client.idle_since = self._loop.time()
-        if self._evict_timer is None:
-            self._evict_timer = self._loop.call_later(self._limits.idle, self._evict)
+        self._evict_later()
 
     # Making and destroying clients.
 
     def _open(self, endpoint: Endpoint) -> None:
-        self._check_open()
+        self.check_open()
 
         def on_room() -> None:
+            client.idle_since = self._loop.time()
+            self._evict_later()
             if endpoint.waiters or endpoint.turns:
                 self._serve_line(endpoint)
 
@@ -514,22 +519,27 @@ class ClientPool:
         )
         endpoint.clients.append(client)
         endpoint.counts.created += 1
+        self._evict_later()
+
+    def _evict_later(self) -> None:
+        if self._evict_timer is None and self._ending is None:
+            self._evict_timer = self._loop.call_later(self._limits.idle, self._evict)
 
     def _evict(self) -> None:
         now = self._loop.time()
-        soonest: float | None = None
+        soonest = math.inf
         for endpoint in self._endpoints.values():
             for client in tuple(endpoint.clients):
+                if not client.is_idle or endpoint.has_callers:
+                    continue
                 ends = client.idle_since + self._limits.idle
-                if ends <= now and client.is_idle and not endpoint.has_callers:
+                if ends > now:
+                    soonest = min(soonest, ends)
+                else:
                     endpoint.clients.remove(client)
                     client.close()
-                elif client.is_idle:
-                    soonest = ends if soonest is None else min(soonest, ends)
-        self._evict_timer = None
-        if soonest is not None:
-            ends = max(soonest, now + 0.01)
-            self._evict_timer = self._loop.call_at(ends, self._evict)
+        waits = soonest < math.inf
+        self._evict_timer = self._loop.call_at(soonest, self._evict) if waits else None
 
     # What the graph shows.
 
@@ -575,7 +585,7 @@ class ClientPool:
     def _on_look_timer(self) -> None:
         self._look_timer = None
         if not self._node.ok():
-            self.end(lambda: ContextShutdown("the rclpy context was shut down"))
+            self.end(_context_shut_down)
             return
         if not self._node.graph_events:
             self._graph += 1
@@ -611,7 +621,8 @@ class ClientPool:
 
     # Errors.
 
-    def _check_open(self) -> None:
+    def check_open(self) -> None:
+        """Raise what calls get, once the session has ended."""
         if self._ending is not None:
             raise self._ending()
 
@@ -643,6 +654,8 @@ class ClientPool:
         elif isinstance(error, _Gone):
             message = "the last server vanished while the request was out"
             error = endpoint.error(ServerGone, message, elapsed)
+        elif not isinstance(error, asyncio.CancelledError | RosasyncError) and not self._node.ok():
+            error = self._ending() if self._ending is not None else _context_shut_down()
         if isinstance(error, asyncio.CancelledError):
             counts.cancelled += 1
         elif isinstance(error, TimeoutError):
@@ -692,6 +705,10 @@ class LeasedClient:
 
 class _Gone(Exception):
     """The last server vanished."""
+
+
+def _context_shut_down() -> Exception:
+    return ContextShutdown("the rclpy context was shut down, or the node destroyed")
 
 
 def _expire(future: asyncio.Future[Any]) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from rosasync import Limits, Retry
 from rosasync.client import Client, Counts, Expired
-from rosasync.testing import FakeClient, FakeGraph
+from rosasync.testing import FakeClient, FakeGraph, FakeNode
 from tests.support.times import TICK, until
 
 
@@ -18,7 +18,7 @@ class Rig:
     """A client, the fake port below it, and how often it said that it has room."""
 
     def __init__(self, **limits: Any) -> None:
-        self.node: Any = FakeGraph().session()._name
+        self.node = FakeNode(FakeGraph())
         self.node.attach(lambda: None, lambda: None)
         self.counts = Counts()
         self.room = 0
