@@ -1,0 +1,117 @@
+"""What all tests share: a ROS domain of this run alone, stock servers, both bridges."""
+
+from __future__ import annotations
+
+import asyncio
+import importlib
+import logging
+import threading
+import warnings
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from typing import Literal
+
+import pytest
+import uvloop
+
+from rosasync import Session
+from rosasync.ros.domain import isolate
+from tests.support.clients import ClientProcess
+from tests.support.servers import ServerProcess
+
+isolate()
+
+with warnings.catch_warnings():
+    # Of rclpy's own dependencies lark still imports sre_parse, which is deprecated.
+    warnings.simplefilter("ignore", DeprecationWarning)
+    importlib.import_module("rosidl_generator_py")
+
+Bridge = Literal["direct", "executor"]
+
+
+def pytest_asyncio_loop_factories(
+    item: pytest.Item,
+) -> Mapping[str, Callable[[], asyncio.AbstractEventLoop]]:
+    """Run on asyncio's own loop, and on uvloop too where the mark ``asyncio`` names it."""
+    marker = item.get_closest_marker("asyncio")
+    if marker is not None and "loop_factories" in marker.kwargs:
+        return {"asyncio": asyncio.new_event_loop, "uvloop": uvloop.new_event_loop}
+    return {"asyncio": asyncio.new_event_loop}
+
+
+@pytest.fixture(autouse=True)
+def nothing_left_behind(caplog: pytest.LogCaptureFixture) -> Iterator[None]:
+    """No test leaves a thread behind, or an exception that only asyncio's logger heard of."""
+    before = set(threading.enumerate())
+    yield
+    assert set(threading.enumerate()) <= before
+    records = [*caplog.get_records("setup"), *caplog.get_records("call")]
+    errors = [r for r in records if r.name == "asyncio" and r.levelno >= logging.ERROR]
+    assert not errors, "\n".join(r.getMessage() for r in errors[:3])
+
+
+@pytest.fixture(params=["direct", "executor"])
+def bridge(request: pytest.FixtureRequest) -> Bridge:
+    """Each of the two bridges."""
+    kind: Bridge = request.param
+    return kind
+
+
+@pytest.fixture
+async def session(bridge: Bridge) -> AsyncIterator[Session]:
+    """An open session, on each bridge."""
+    async with Session("test_client", bridge=bridge) as session:
+        yield session
+    assert session.closed
+
+
+class _Processes:
+    """The processes kept for the whole run: starting one takes longer than most tests."""
+
+    def __init__(self) -> None:
+        self._server: ServerProcess | None = None
+        self._client: ClientProcess | None = None
+
+    def server(self) -> ServerProcess:
+        if self._server is None or not self._server.alive:
+            self._server = ServerProcess()
+        return self._server
+
+    def client(self) -> ClientProcess:
+        if self._client is None or not self._client.alive:
+            self._client = ClientProcess()
+        return self._client
+
+    def close(self) -> None:
+        for child in (self._server, self._client):
+            if child is not None and child.alive:
+                child.close()
+
+
+@pytest.fixture(scope="session")
+def processes() -> Iterator[_Processes]:
+    """The processes of the run."""
+    processes = _Processes()
+    yield processes
+    processes.close()
+
+
+@pytest.fixture
+def server(processes: _Processes) -> Iterator[ServerProcess]:
+    """A process of stock servers, without any service yet."""
+    server = processes.server()
+    yield server
+    if server.alive:
+        server.ask_now("clear")
+
+
+@pytest.fixture
+def client_process(processes: _Processes) -> ClientProcess:
+    """A process of stock clients."""
+    return processes.client()
+
+
+@pytest.fixture
+async def echo(server: ServerProcess) -> str:
+    """The name of a stock service of default QoS that echoes."""
+    await server.serve("/echo")
+    return "/echo"

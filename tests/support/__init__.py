@@ -1,0 +1,1 @@
+"""What the tests share: servers in other processes, domains, waiting without sleeping."""

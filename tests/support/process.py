@@ -1,0 +1,157 @@
+"""Child processes of the tests, driven by JSON lines on their stdin and stdout.
+
+The parent holds a :class:`Child`; the child runs :func:`serve_commands`. A child ends when its
+stdin does, so none outlives the tests.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import select
+import subprocess
+import sys
+import threading
+import traceback
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import IO, Any, Self
+
+from tests.support.times import LIMIT
+
+__all__ = ["Child", "ChildError", "serve_commands"]
+
+ROOT = Path(__file__).parents[2]
+SHARED_MEMORY = Path("/dev/shm")
+
+
+class ChildError(Exception):
+    """What went wrong in the child, with its traceback."""
+
+
+class Child:
+    """A child process that runs one of the modules beside this one.
+
+    It belongs to no loop: it may be made in a fixture of the whole run and used in any test.
+    """
+
+    module: str
+
+    def __init__(self, *args: str, env: Mapping[str, str] | None = None) -> None:
+        self._lock = threading.Lock()
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", self.module, *args],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            cwd=ROOT,
+            env={**os.environ, **(env or {})},
+        )
+        self.ask_now("ready")
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    @property
+    def alive(self) -> bool:
+        return self._process.poll() is None
+
+    @property
+    def cpu_seconds(self) -> float:
+        """User and system time the child has used so far."""
+        fields = Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+    def ask_now(self, command: str, **arguments: Any) -> Any:
+        """Send a command and block until it is answered, which the child sees to in time."""
+        stdin, stdout = self._pipes()
+        with self._lock:
+            stdin.write(json.dumps({"do": command, "with": arguments}).encode() + b"\n")
+            stdin.flush()
+            ready, _, _ = select.select([stdout], [], [], 4 * LIMIT)
+            assert ready, f"{self.module} did not answer {command!r}"
+            line = stdout.readline()
+        assert line, f"{self.module} ended with code {self._process.wait()}"
+        answer = json.loads(line)
+        if "error" in answer:
+            raise ChildError(answer["error"])
+        return answer["value"]
+
+    async def ask(self, command: str, **arguments: Any) -> Any:
+        """The same without blocking the loop."""
+        return await asyncio.to_thread(self.ask_now, command, **arguments)
+
+    def kill(self) -> None:
+        """End it as a crash does (SIGKILL), and remove the shared memory it leaves behind."""
+        leftovers = self._shared_memory()
+        self._process.kill()
+        self._reap()
+        for file in leftovers:
+            file.unlink(missing_ok=True)
+
+    def close(self) -> None:
+        """End it in an orderly way; killed if it does not."""
+        with suppress(BrokenPipeError):
+            self._pipes()[0].close()
+        try:
+            self._process.wait(LIMIT / 4)
+        except subprocess.TimeoutExpired:
+            self.kill()
+            raise
+        self._reap()
+
+    def _reap(self) -> None:
+        self._process.wait()
+        for pipe in self._pipes():
+            with suppress(BrokenPipeError):
+                pipe.close()
+
+    def _pipes(self) -> tuple[IO[bytes], IO[bytes]]:
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        return self._process.stdin, self._process.stdout
+
+    def _shared_memory(self) -> list[Path]:
+        """The Fast DDS segments of this process: it holds the lock file ``…_el`` of each."""
+        files: list[Path] = []
+        for descriptor in Path(f"/proc/{self.pid}/fd").glob("*"):
+            with suppress(OSError):
+                lock = descriptor.readlink()
+                if lock.parent == SHARED_MEMORY and lock.name.endswith("_el"):
+                    files += [lock, lock.with_name(lock.name.removesuffix("_el"))]
+        return files
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        if self.alive:
+            self.close()
+        else:
+            self._reap()
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *exc: object) -> None:
+        await asyncio.to_thread(self.__exit__, *exc)
+
+
+def serve_commands(commands: Mapping[str, Callable[..., Any]]) -> None:
+    """Answer the parent's commands one by one, until it closes the pipe or ends.
+
+    Args:
+        commands: what each of them does; called with the command's arguments by keyword, the value
+            returned goes to the parent as JSON.
+    """
+    commands = {"ready": lambda: None, **commands}
+    for line in sys.stdin.buffer:
+        message = json.loads(line)
+        try:
+            answer = {"value": commands[message["do"]](**message["with"])}
+        except Exception:
+            answer = {"error": traceback.format_exc()}
+        sys.stdout.write(json.dumps(answer) + "\n")
+        sys.stdout.flush()

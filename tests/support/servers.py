@@ -1,0 +1,305 @@
+"""A process of stock rclpy servers: ``python -m tests.support.servers``.
+
+Services are made with ``node.create_service`` and spun by a ``SingleThreadedExecutor``. Where a
+test wants an answer late, in another order or never, only the sending of it is put off.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import random
+import threading
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Literal, TypeVar
+
+from tests.support.echo import ECHO, fill, response_to, service_class
+from tests.support.process import Child, serve_commands
+from tests.support.times import LIMIT
+
+__all__ = ["Delay", "ServerProcess"]
+
+T = TypeVar("T")
+
+Delay = float | tuple[float, float] | Literal["hold", "never"] | None
+"""When a request is answered: at once (None), after so many seconds, after a random time between
+the two, when :meth:`ServerProcess.release` says so, or never."""
+
+_PROFILE_VARIABLE = (
+    "FASTRTPS_DEFAULT_PROFILES_FILE"
+    if version("rclpy").startswith("7.")
+    else "FASTDDS_DEFAULT_PROFILES_FILE"
+)
+
+# New sessions come and go with every test. Announcing itself more often than every 3 s, the process
+# is found at once even by one that takes the place of another.
+_PROFILE = """<?xml version="1.0" encoding="UTF-8" ?>
+<profiles xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
+  <participant profile_name="server" is_default_profile="true"><rtps><builtin><discovery_config>
+    <leaseDuration><sec>{seconds}</sec></leaseDuration>
+    <leaseAnnouncement><sec>0</sec><nanosec>200000000</nanosec></leaseAnnouncement>
+  </discovery_config></builtin></rtps></participant>
+</profiles>
+"""
+
+
+class ServerProcess(Child):
+    """The parent's side of one such process.
+
+    Args:
+        lease: seconds after which the others notice that it was killed, as in the middleware.
+    """
+
+    module = "tests.support.servers"
+
+    def __init__(self, *, lease: int = 20) -> None:
+        with TemporaryDirectory() as folder:
+            profile = Path(folder) / "profile.xml"
+            profile.write_text(_PROFILE.format(seconds=lease))
+            super().__init__(env={_PROFILE_VARIABLE: str(profile)})
+
+    async def serve(
+        self,
+        name: str,
+        srv_type: str = ECHO,
+        *,
+        delay: Delay = None,
+        skip: int = 0,
+        depth: int | None = None,
+        copies: int = 1,
+    ) -> None:
+        """Create a service; it is there when this returns.
+
+        Args:
+            name: of the service.
+            srv_type: the name of its type.
+            delay: when it answers.
+            skip: the first so many requests are not answered.
+            depth: of its history; the default of ROS, 10, where it is left out.
+            copies: how many services to make under this name.
+        """
+        await self.ask(
+            "serve",
+            name=name,
+            srv_type=srv_type,
+            delay=delay,
+            skip=skip,
+            depth=depth,
+            copies=copies,
+        )
+
+    async def stop(self, name: str) -> None:
+        """Destroy the services of this name."""
+        await self.ask("stop", name=name)
+
+    async def change(self, name: str, delay: Delay) -> None:
+        """Answer from now on so; what is held stays held."""
+        await self.ask("change", name=name, delay=delay)
+
+    async def release(self, name: str, count: int | None = None, *, newest: bool = False) -> None:
+        """Answer requests that are held: all or so many, the oldest (or newest) first."""
+        await self.ask("release", name=name, count=count, newest=newest)
+
+    async def received(self, name: str, at_least: int = 0) -> list[str]:
+        """What the requests that came so far carried, in order; waits until so many have come."""
+        result: list[str] = await self.ask("received", name=name, at_least=at_least)
+        return result
+
+    async def answered(self, name: str, at_least: int = 0) -> int:
+        """How many responses were sent; waits until so many were."""
+        result: int = await self.ask("answered", name=name, at_least=at_least)
+        return result
+
+    async def clear(self) -> None:
+        """Destroy all services and forget what they counted."""
+        await self.ask("clear")
+
+
+class _Later:
+    """Runs functions at their time, in one thread."""
+
+    def __init__(self) -> None:
+        self._heap: list[tuple[float, int, Callable[[], None]]] = []
+        self._order = itertools.count()
+        self._changed = threading.Condition()
+        threading.Thread(target=self._run, daemon=True).start()
+
+    def add(self, seconds: float, function: Callable[[], None]) -> None:
+        with self._changed:
+            heapq.heappush(self._heap, (time.monotonic() + seconds, next(self._order), function))
+            self._changed.notify()
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                while not self._heap or self._heap[0][0] > time.monotonic():
+                    wait = self._heap[0][0] - time.monotonic() if self._heap else None
+                    self._changed.wait(wait)
+                function = heapq.heappop(self._heap)[2]
+            function()
+
+
+class _Service:
+    """One name of the process: its rclpy services, its mode and its counts."""
+
+    def __init__(self, delay: Delay, skip: int, later: _Later) -> None:
+        self.delay = delay
+        self.received: list[str] = []
+        self.answered = 0
+        self.services: list[Any] = []
+        self.changed = threading.Condition()
+        self._skip = skip
+        self._held: list[Callable[[], None]] = []
+        self._later = later
+
+    def add(self, service: Any) -> None:
+        """Put a service made with ``handle`` under this mode."""
+        service.send_response = partial(self._respond, service.send_response)
+        self.services.append(service)
+
+    def handle(self, request: Any, response: Any) -> Any:
+        with self.changed:
+            self.received.append(response_to(request))
+            self.changed.notify_all()
+        return fill(request, response)
+
+    def release(self, count: int | None, newest: bool) -> None:
+        for _ in range(len(self._held) if count is None else count):
+            self._held.pop(-1 if newest else 0)()
+
+    def _respond(self, send: Callable[[Any, Any], None], response: Any, header: Any) -> None:
+        answer = partial(self._answer, send, response, header)
+        if self._skip:
+            self._skip -= 1
+        elif self.delay is None:
+            answer()
+        elif self.delay == "hold":
+            self._held.append(answer)
+        elif isinstance(self.delay, Sequence) and not isinstance(self.delay, str):
+            self._later.add(random.uniform(*self.delay), answer)
+        elif isinstance(self.delay, float | int):
+            self._later.add(self.delay, answer)
+
+    def _answer(self, send: Callable[[Any, Any], None], response: Any, header: Any) -> None:
+        from rclpy.exceptions import InvalidHandle
+
+        with suppress(InvalidHandle):
+            send(response, header)
+            with self.changed:
+                self.answered += 1
+                self.changed.notify_all()
+
+
+class _Servers:
+    """The child's side: the commands, run in the thread that reads them."""
+
+    def __init__(self, node: Any, executor: Any) -> None:
+        self._node = node
+        self._executor = executor
+        self._later = _Later()
+        self._services: dict[str, _Service] = {}
+
+    def commands(self) -> dict[str, Callable[..., Any]]:
+        names = ("serve", "stop", "change", "release", "received", "answered", "clear")
+        return {name: getattr(self, name) for name in names}
+
+    def serve(
+        self, name: str, srv_type: str, delay: Delay, skip: int, depth: int | None, copies: int
+    ) -> None:
+        from rclpy.qos import QoSProfile, qos_profile_services_default
+
+        qos = qos_profile_services_default if depth is None else QoSProfile(depth=depth)
+        kept = self._services.get(name)
+        service = kept or _Service(delay, skip, self._later)
+        service.delay = delay
+        self._services[name] = service
+
+        def create() -> None:
+            for _ in range(copies):
+                service.add(
+                    self._node.create_service(
+                        service_class(srv_type), name, service.handle, qos_profile=qos
+                    )
+                )
+
+        self._in_executor(create)
+
+    def stop(self, name: str) -> None:
+        service = self._services[name]
+
+        def destroy() -> None:
+            while service.services:
+                self._node.destroy_service(service.services.pop())
+
+        self._in_executor(destroy)
+
+    def change(self, name: str, delay: Delay) -> None:
+        self._services[name].delay = delay
+
+    def release(self, name: str, count: int | None, newest: bool) -> None:
+        self._in_executor(partial(self._services[name].release, count, newest))
+
+    def received(self, name: str, at_least: int) -> list[str]:
+        service = self._services[name]
+        with service.changed:
+            service.changed.wait_for(lambda: len(service.received) >= at_least, LIMIT)
+            assert len(service.received) >= at_least, f"{len(service.received)} < {at_least}"
+            return list(service.received)
+
+    def answered(self, name: str, at_least: int) -> int:
+        service = self._services[name]
+        with service.changed:
+            service.changed.wait_for(lambda: service.answered >= at_least, LIMIT)
+            assert service.answered >= at_least, f"{service.answered} < {at_least}"
+            return service.answered
+
+    def clear(self) -> None:
+        for name in self._services:
+            self.stop(name)
+        self._services.clear()
+
+    def _in_executor(self, function: Callable[[], T]) -> T:
+        """Run it in the thread that spins: rclpy has crashed on changes from another one."""
+        done = threading.Event()
+        task = self._executor.create_task(function)
+        task.add_done_callback(lambda _: done.set())
+        assert done.wait(LIMIT), "the executor of the server process is stuck"
+        result: T = task.result()
+        return result
+
+
+def main() -> None:
+    import rclpy
+    from rclpy.executors import SingleThreadedExecutor
+    from rclpy.signals import SignalHandlerOptions
+
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    node = rclpy.create_node("stock_server")
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    servers = _Servers(node, executor)
+    finished = threading.Event()
+
+    def read() -> None:
+        serve_commands(servers.commands())
+        finished.set()
+        executor.create_task(lambda: None)
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    while not finished.is_set():
+        executor.spin_once()
+    reader.join()
+    executor.shutdown()
+    node.destroy_node()
+    rclpy.shutdown()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,114 @@
+"""Handlers that echo, in every form a server takes, and what a test looks at in a server."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING, Any
+
+from diagnostic_msgs.srv import AddDiagnostics
+
+from tests.support.echo import ECHO, answer_to, request_of
+from tests.support.times import until
+
+if TYPE_CHECKING:
+    from rosasync import ServiceCall, ServiceServer, Session
+
+__all__ = ["FORMS", "Holder", "ask", "echo_of", "serving", "settled"]
+
+
+def echo_of(request: Any) -> Any:
+    """The response that echoes a request."""
+    return AddDiagnostics.Response(success=True, message=request.load_namespace)
+
+
+def ask(session: Session, name: str, text: str, **options: Any) -> asyncio.Task[str]:
+    """Call a service of the echoing type; the task gives the text that comes back."""
+
+    async def call() -> str:
+        return answer_to(await session.call(ECHO, name, request_of(text), **options))
+
+    return asyncio.create_task(call())
+
+
+class Holder:
+    """A handler that answers nothing: it keeps the calls, for the test to answer."""
+
+    def __init__(self) -> None:
+        self.calls: list[ServiceCall] = []
+
+    def __call__(self, call: ServiceCall) -> None:
+        self.calls.append(call)
+
+    async def held(self, count: int) -> list[ServiceCall]:
+        """Wait until so many calls have come."""
+        await until(lambda: len(self.calls) >= count)
+        return self.calls
+
+
+def _plain_pair(request: Any, response: Any) -> Any:
+    response.message = request.load_namespace
+    return response
+
+
+async def _async_pair(request: Any, response: Any) -> Any:
+    await asyncio.sleep(0)
+    return _plain_pair(request, response)
+
+
+def _plain_call(call: ServiceCall) -> Any:
+    call.response.message = call.request.load_namespace
+    return call.response
+
+
+async def _async_call(call: ServiceCall) -> Any:
+    await asyncio.sleep(0)
+    return _plain_call(call)
+
+
+def _responding(call: ServiceCall) -> None:
+    call.respond(echo_of(call.request))
+
+
+async def _responding_later(call: ServiceCall) -> None:
+    asyncio.get_running_loop().call_soon(call.respond, echo_of(call.request))
+
+
+FORMS: dict[str, Callable[..., Any] | None] = {
+    "plain, request and response": _plain_pair,
+    "async, request and response": _async_pair,
+    "plain, call": _plain_call,
+    "async, call": _async_call,
+    "plain, respond": _responding,
+    "async, respond after the return": _responding_later,
+    "iteration": None,
+}
+"""Each form of a server that echoes; None for iteration."""
+
+
+@asynccontextmanager
+async def serving(session: Session, name: str, form: str) -> AsyncIterator[ServiceServer]:
+    """Serve an echo in one of the forms."""
+    async with session.serve(ECHO, name, FORMS[form]) as server:
+        if FORMS[form] is not None:
+            yield server
+            return
+
+        async def iterate() -> None:
+            async for call in server:
+                call.respond(echo_of(call.request))
+
+        task = asyncio.create_task(iterate())
+        yield server
+    await task
+
+
+async def settled(server: ServiceServer) -> None:
+    """Wait until nothing runs, waits or is unanswered."""
+
+    def rests() -> bool:
+        now = server.statistics()
+        return now.running == now.waiting == now.unanswered == 0
+
+    await until(rests)

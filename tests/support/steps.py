@@ -1,0 +1,97 @@
+"""Cancel a call at a chosen await of its way, and at a chosen moment of that await."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import types
+from collections.abc import AsyncIterator, Callable, Coroutine, Generator
+from typing import Any, Literal, TypeVar, get_args
+
+__all__ = ["MOMENTS", "Moment", "Victim", "every_victim"]
+
+T = TypeVar("T")
+
+Moment = Literal["as it suspends", "in the next turn", "as it wakes"]
+"""When the cancellation comes: before the loop has seen the await; in the turn after; or when what
+is awaited is done already, and only the task does not know it yet."""
+
+MOMENTS: tuple[Moment, ...] = get_args(Moment)
+
+
+class Victim:
+    """A task that runs a coroutine and is cancelled at one of its awaits.
+
+    Args:
+        coroutine: to run.
+        suspension: which await, counted from 0.
+        moment: of that await.
+    """
+
+    def __init__(self, coroutine: Coroutine[Any, Any, Any], suspension: int, moment: Moment):
+        self.struck = False
+        self.suspensions = 0
+        self._target = suspension
+        self._moment = moment
+        self.task = asyncio.get_running_loop().create_task(_watched(coroutine, self._suspended))
+
+    def __repr__(self) -> str:
+        return f"<Victim await {self._target}, {self._moment}>"
+
+    def _suspended(self, awaited: Any) -> None:
+        number, self.suspensions = self.suspensions, self.suspensions + 1
+        if number != self._target:
+            return
+        if self._moment == "as it suspends":
+            self._strike()
+        elif self._moment == "in the next turn" or awaited is None:
+            self.task.get_loop().call_soon(self._strike)
+        else:
+            awaited.add_done_callback(lambda _: self._strike())
+
+    def _strike(self) -> None:
+        if not self.task.done():
+            self.struck = True
+            self.task.cancel()
+
+
+async def every_victim(
+    make: Callable[[], Coroutine[Any, Any, Any]],
+    moments: tuple[Moment, ...] = MOMENTS,
+) -> AsyncIterator[Victim]:
+    """Give one victim after the other, until a call has no such await any more.
+
+    Args:
+        make: makes the coroutine of the next victim, which begins when it is given.
+        moments: of each await.
+    """
+    for suspension in itertools.count():
+        struck = False
+        for moment in moments:
+            victim = Victim(make(), suspension, moment)
+            yield victim
+            assert victim.task.done(), "the test has to see its victim's end"
+            struck = struck or victim.struck
+        if not struck:
+            assert suspension > 0, "a call that never waits shows nothing"
+            return
+
+
+@types.coroutine
+def _watched(
+    coroutine: Coroutine[Any, Any, T], suspended: Callable[[Any], None]
+) -> Generator[Any, Any, T]:
+    """Run a coroutine as ``await`` does, telling what it waits for each time it suspends."""
+    try:
+        awaited = coroutine.send(None)
+        while True:
+            suspended(awaited)
+            try:
+                value = yield awaited
+            except BaseException as error:
+                awaited = coroutine.throw(error)
+            else:
+                awaited = coroutine.send(value)
+    except StopIteration as end:
+        result: T = end.value
+        return result

@@ -1,0 +1,31 @@
+"""The one unit of time of the tests: every delay, timeout and limit is a multiple of ``TICK``."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+
+__all__ = ["LIMIT", "TICK", "until"]
+
+TICK = 0.05
+"""Seconds: long beside a call (about 0.3 ms), short beside a test."""
+
+LIMIT = 400 * TICK
+"""Seconds after which anything that was to happen is taken to have failed."""
+
+
+async def until(condition: Callable[[], object], limit: float = LIMIT) -> None:
+    """Wait for a state that has no event of its own, as a statistics counter.
+
+    Args:
+        condition: called in the loop every tenth of a tick until it answers truly.
+        limit: seconds.
+
+    Raises:
+        AssertionError: the condition did not come true in time.
+    """
+    deadline = time.monotonic() + limit
+    while not condition():
+        assert time.monotonic() < deadline, f"not within {limit:g} s: {condition}"
+        await asyncio.sleep(TICK / 10)

@@ -1,0 +1,226 @@
+"""The executor thread, borrowed nodes and contexts, and what callbacks can do to a session."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import pytest
+import rclpy
+from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
+from rclpy.signals import SignalHandlerOptions
+from std_msgs.msg import Empty
+
+from rosasync import Limits, Session
+from tests.support.checks import assert_clean, check_call
+from tests.support.times import LIMIT, TICK
+
+if TYPE_CHECKING:
+    from tests.conftest import Bridge
+
+
+@contextmanager
+def spinning(executor: Any) -> Iterator[None]:
+    """Spin an executor in a thread, as a program without asyncio does."""
+    stop = threading.Event()
+
+    def spin() -> None:
+        while not stop.is_set():
+            executor.spin_once()
+
+    thread = threading.Thread(target=spin)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        executor.create_task(lambda: None)
+        thread.join()
+        executor.shutdown()
+
+
+@pytest.fixture
+def context() -> Iterator[Any]:
+    """A context that is not the session's."""
+    context = rclpy.Context()
+    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
+    yield context
+    assert context.ok()
+    context.shutdown()
+
+
+@pytest.fixture
+def node(context: Any) -> Iterator[Any]:
+    """A node that is not the session's."""
+    node = rclpy.create_node("lender", context=context)
+    yield node
+    node.destroy_node()
+
+
+class TestOwnThread:
+    """The thread of a session that has a node of its own."""
+
+    async def test_it_spins_the_nodes_timers_and_subscriptions(
+        self, session: Session, echo: str
+    ) -> None:
+        loop = asyncio.get_running_loop()
+        ticked, heard = asyncio.Event(), asyncio.Event()
+        threads: set[int] = set()
+
+        def tick() -> None:
+            threads.add(threading.get_ident())
+            publisher.publish(Empty())
+            loop.call_soon_threadsafe(ticked.set)
+
+        publisher = session.node.create_publisher(Empty, "/topic", 10)
+        session.node.create_subscription(
+            Empty, "/topic", lambda _: loop.call_soon_threadsafe(heard.set), 10
+        )
+        session.node.create_timer(TICK, tick)
+        async with asyncio.timeout(LIMIT):
+            await ticked.wait()
+            await heard.wait()
+        await check_call(session, echo, "beside them")
+        assert threading.get_ident() not in threads
+        assert len(threads) == 1
+
+    async def test_a_callback_that_raises_reaches_the_loops_handler(
+        self, session: Session, echo: str
+    ) -> None:
+        reported: asyncio.Queue[dict[str, Any]] = asyncio.Queue()
+        asyncio.get_running_loop().set_exception_handler(
+            lambda _, details: reported.put_nowait(details)
+        )
+
+        def fail() -> None:
+            raise ZeroDivisionError("in the timer")
+
+        timer = session.node.create_timer(TICK / 5, fail)
+        async with asyncio.timeout(LIMIT):
+            for number in range(5):
+                details = await reported.get()
+                assert isinstance(details["exception"], ZeroDivisionError)
+                assert "in the timer" in str(details["exception"])
+                await check_call(session, echo, str(number))
+        session.node.destroy_timer(timer)
+        await check_call(session, echo, "afterwards")
+        await assert_clean(session)
+
+    async def test_a_slow_callback_does_not_delay_the_direct_bridge(self, echo: str) -> None:
+        async with Session("slow", bridge="direct") as session:
+            await check_call(session, echo, "before")
+            entered, leave = threading.Event(), threading.Event()
+
+            def block() -> None:
+                entered.set()
+                leave.wait(LIMIT)
+
+            timer = session.node.create_timer(0.0, block)
+            try:
+                await asyncio.to_thread(entered.wait, LIMIT)
+                for number in range(20):
+                    await check_call(session, echo, str(number), timeout=LIMIT / 4)
+                assert not leave.is_set()
+            finally:
+                timer.cancel()
+                leave.set()
+
+    async def test_closing_waits_for_a_callback_under_way(self, bridge: Bridge) -> None:
+        entered, left = threading.Event(), threading.Event()
+        async with Session("busy", bridge=bridge) as session:
+
+            def work() -> None:
+                entered.set()
+                timer.cancel()
+                threading.Event().wait(4 * TICK)
+                left.set()
+
+            timer = session.node.create_timer(0.0, work)
+            await asyncio.to_thread(entered.wait, LIMIT)
+        assert left.is_set()
+
+    async def test_entities_of_the_node_come_and_go_while_it_spins(
+        self, session: Session, echo: str
+    ) -> None:
+        for number in range(50):
+            publisher = session.node.create_publisher(Empty, f"/topic_{number}", 10)
+            subscription = session.node.create_subscription(
+                Empty, f"/topic_{number}", lambda _: None, 10
+            )
+            publisher.publish(Empty())
+            await check_call(session, echo, str(number))
+            session.node.destroy_subscription(subscription)
+            session.node.destroy_publisher(publisher)
+
+
+class TestBorrowed:
+    """What is passed in is neither shut down nor destroyed."""
+
+    async def test_a_context(self, bridge: Bridge, context: Any, echo: str) -> None:
+        for number in range(2):
+            async with Session("guest", bridge=bridge, context=context) as session:
+                assert session.node.context is context
+                await check_call(session, echo, str(number))
+            assert context.ok()
+
+    async def test_a_node_that_nobody_spins(self, bridge: Bridge, node: Any, echo: str) -> None:
+        for number in range(2):
+            async with Session(node, bridge=bridge) as session:
+                assert session.node is node
+                await check_call(session, echo, str(number))
+            assert node.executor is None
+            assert node.get_name() == "lender"
+            assert not list(node.clients)
+
+    @pytest.mark.parametrize("kind", [SingleThreadedExecutor, MultiThreadedExecutor])
+    async def test_a_node_in_the_users_own_executor(
+        self, bridge: Bridge, node: Any, echo: str, kind: Any
+    ) -> None:
+        loop = asyncio.get_running_loop()
+        ticked = asyncio.Event()
+        node.create_timer(TICK / 5, lambda: loop.call_soon_threadsafe(ticked.set))
+        executor = kind(context=node.context)
+        executor.add_node(node)
+        with spinning(executor):
+            async with Session(node, bridge=bridge) as session:
+                for number in range(100):
+                    await check_call(session, echo, str(number))
+                assert node.executor is executor
+                await assert_clean(session)
+            ticked.clear()
+            async with asyncio.timeout(LIMIT):
+                await ticked.wait()
+            assert node.executor is executor
+            executor.remove_node(node)
+
+    async def test_an_executor_for_a_node_of_its_own(
+        self, bridge: Bridge, context: Any, echo: str
+    ) -> None:
+        executor = SingleThreadedExecutor(context=context)
+        with spinning(executor):
+            async with Session(
+                "guest", bridge=bridge, context=context, executor=executor
+            ) as session:
+                assert session.node in executor.get_nodes()
+                await check_call(session, echo, "text")
+            assert not executor.get_nodes()
+
+    async def test_two_sessions_on_one_node_in_the_users_executor(
+        self, bridge: Bridge, node: Any, echo: str
+    ) -> None:
+        executor = SingleThreadedExecutor(context=node.context)
+        executor.add_node(node)
+        half = Limits(in_flight=5)
+        with spinning(executor):
+            async with (
+                Session(node, bridge=bridge, limits=half) as one,
+                Session(node, bridge=bridge, limits=half) as two,
+            ):
+                await asyncio.gather(
+                    *(check_call(one, echo, f"one {n}") for n in range(50)),
+                    *(check_call(two, echo, f"two {n}") for n in range(50)),
+                )
+            executor.remove_node(node)

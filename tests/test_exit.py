@@ -1,0 +1,174 @@
+"""Programs that end in ways a session does not expect: no abort, no hang, no silence."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from tests.conftest import Bridge
+from tests.support.process import ROOT
+from tests.support.servers import ServerProcess
+from tests.support.times import LIMIT
+
+BEGINNING = """
+import asyncio, sys, warnings
+from rosasync import Session
+from tests.support.checks import check_call
+
+async def opened(bridge):
+    session = Session("left_open", bridge=bridge)
+    await session.__aenter__()
+    await check_call(session, "/echo", "text")
+    print("called", flush=True)
+    return session
+
+bridge = sys.argv[1]
+"""
+
+
+async def run(bridge: Bridge, program: str, send: int | None = None) -> tuple[int, str]:
+    """Run a program to its end; its exit code and what it wrote to stderr."""
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-W", "default::ResourceWarning", "-c", BEGINNING + program, bridge),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        cwd=ROOT,
+    )
+    assert process.stdout is not None
+    try:
+        async with asyncio.timeout(2 * LIMIT):
+            assert await process.stdout.readline() == b"called\n"
+            if send is not None:
+                process.send_signal(send)
+            _, errors = await process.communicate()
+    finally:
+        if process.returncode is None:
+            process.kill()
+            await process.wait()
+    assert process.returncode is not None
+    text = errors.decode()
+    assert "terminate called" not in text
+    return process.returncode, text
+
+
+@pytest.mark.usefixtures("echo")
+class TestLeftOpen:
+    """A session that nobody closes says so, and ends with the interpreter."""
+
+    async def test_held_by_the_program(self, bridge: Bridge) -> None:
+        code, errors = await run(bridge, "session = asyncio.run(opened(bridge))")
+        assert code == 0, errors
+        assert "ResourceWarning: unclosed <Session 'left_open'" in errors
+        assert "Traceback" not in errors
+
+    async def test_dropped_by_the_program(self, bridge: Bridge) -> None:
+        code, errors = await run(bridge, "asyncio.run(opened(bridge))")
+        assert code == 0, errors
+        assert "ResourceWarning: unclosed <Session 'left_open'" in errors
+        assert "Traceback" not in errors
+
+    async def test_dropped_in_a_loop_that_goes_on(self, bridge: Bridge) -> None:
+        program = """
+import gc, threading
+async def main():
+    await opened(bridge)
+    gc.collect()
+    while [t for t in threading.enumerate() if t.name.startswith("rosasync")]:
+        await asyncio.sleep(0.01)
+    async with Session("next", bridge=bridge) as session:
+        await check_call(session, "/echo", "text")
+asyncio.run(main())
+"""
+        code, errors = await run(bridge, program)
+        assert code == 0, errors
+        assert "ResourceWarning: unclosed <Session" in errors
+        assert "Traceback" not in errors
+
+    async def test_with_a_call_out(self, bridge: Bridge, server: ServerProcess) -> None:
+        await server.serve("/never", delay="never")
+        program = """
+from tests.support.echo import ECHO
+async def main():
+    session = await opened(bridge)
+    session.start(ECHO, "/never", timeout=None)
+    await asyncio.sleep(0.1)
+asyncio.run(main())
+"""
+        code, errors = await run(bridge, program)
+        assert code == 0, errors
+        assert "ResourceWarning: unclosed <Session" in errors
+
+
+@pytest.mark.usefixtures("echo")
+class TestAbruptEnds:
+    """The program's own end comes before the session's."""
+
+    async def test_an_exception_in_the_block(self, bridge: Bridge) -> None:
+        program = """
+async def main():
+    async with Session("raiser", bridge=bridge) as session:
+        await check_call(session, "/echo", "text")
+        print("called", flush=True)
+        raise SystemExit(7)
+asyncio.run(main())
+"""
+        code, errors = await run(bridge, program)
+        assert code == 7, errors
+        assert "ResourceWarning" not in errors
+
+    async def test_ctrl_c_while_a_call_is_out(self, bridge: Bridge, server: ServerProcess) -> None:
+        await server.serve("/never", delay="never")
+        program = """
+from tests.support.echo import ECHO
+async def main():
+    async with Session("interrupted", bridge=bridge) as session:
+        await check_call(session, "/echo", "text")
+        task = session.start(ECHO, "/never", timeout=None)
+        await asyncio.sleep(0)
+        print("called", flush=True)
+        await task
+asyncio.run(main())
+"""
+        code, errors = await run(bridge, program, signal.SIGINT)
+        assert code in (130, -signal.SIGINT), errors
+        assert "KeyboardInterrupt" in errors
+        assert "ResourceWarning" not in errors
+
+    async def test_a_loop_closed_under_an_open_session(
+        self, bridge: Bridge, server: ServerProcess
+    ) -> None:
+        await server.serve("/slow", delay=0.3)
+        program = """
+import time
+from tests.support.echo import ECHO, request_of
+loop = asyncio.new_event_loop()
+session = loop.run_until_complete(opened(bridge))
+async def send_and_give_up():
+    task = session.start(ECHO, "/slow", request_of("out"))
+    await asyncio.sleep(0.1)
+    task.cancel()
+    await asyncio.wait([task])
+loop.run_until_complete(send_and_give_up())
+loop.close()
+time.sleep(0.5)
+"""
+        code, errors = await run(bridge, program)
+        assert code == 0, errors
+        assert "ResourceWarning: unclosed <Session" in errors
+        assert "Traceback" not in errors
+
+    async def test_the_context_goes_down_first(self, bridge: Bridge) -> None:
+        program = """
+async def main():
+    session = await opened(bridge)
+    session.node.context.shutdown()
+    await session.aclose()
+asyncio.run(main())
+"""
+        code, errors = await run(bridge, program)
+        assert code == 0, errors
+        assert errors == ""

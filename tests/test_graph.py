@@ -1,0 +1,159 @@
+"""What the ROS graph tells: servers that appear, vanish, or are not what was asked for."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING
+
+import pytest
+from rclpy.qos import QoSProfile, QoSReliabilityPolicy
+
+from rosasync import ServiceUnavailable, Session
+from tests.support.checks import assert_clean, check_call
+from tests.support.echo import ECHO, answer_to, request_of
+from tests.support.servers import ServerProcess
+from tests.support.times import LIMIT, TICK, until
+
+if TYPE_CHECKING:
+    from tests.conftest import Bridge
+
+
+async def seen(session: Session, name: str) -> None:
+    """Wait until the session's node knows that the stock server's node serves this name."""
+
+    def listed() -> bool:
+        if "stock_server" not in session.node.get_node_names():
+            return False
+        services = session.node.get_service_names_and_types_by_node("stock_server", "/")
+        return name in [service for service, _ in services]
+
+    await until(listed)
+
+
+class TestUnavailable:
+    """The message says what was seen instead."""
+
+    async def test_nothing(self, session: Session) -> None:
+        with pytest.raises(ServiceUnavailable, match="/echo") as caught:
+            await session.call(ECHO, "echo", timeout=2 * TICK)
+        assert caught.value.srv_name == "/echo"
+        assert caught.value.srv_type == ECHO
+        assert 2 * TICK <= caught.value.elapsed < LIMIT
+        statistics = session.pool.statistics()
+        assert (statistics.timed_out, statistics.in_flight, statistics.waiting) == (1, 0, 0)
+
+    async def test_the_name_under_another_type(
+        self, session: Session, server: ServerProcess
+    ) -> None:
+        await server.serve("/enable", "std_srvs/srv/SetBool")
+        await seen(session, "/enable")
+        with pytest.raises(ServiceUnavailable, match="std_srvs/srv/SetBool"):
+            await session.call("std_srvs/srv/Trigger", "/enable", timeout=4 * TICK)
+
+    async def test_a_similar_name(self, session: Session, server: ServerProcess) -> None:
+        await server.serve("/arm/enable")
+        await seen(session, "/arm/enable")
+        with pytest.raises(ServiceUnavailable, match="/arm/enable"):
+            await session.call(ECHO, "/arm/enabel", timeout=4 * TICK)
+
+    async def test_a_qos_that_does_not_match(self, session: Session, echo: str) -> None:
+        await seen(session, echo)
+        best_effort = QoSProfile(depth=10, reliability=QoSReliabilityPolicy.BEST_EFFORT)
+        with pytest.raises(ServiceUnavailable, match="(?i)qos"):
+            await session.call(ECHO, echo, qos=best_effort, timeout=4 * TICK)
+        await check_call(session, echo, "the default matches")
+
+    async def test_at_once_where_nobody_wants_to_wait(
+        self, session: Session, server: ServerProcess
+    ) -> None:
+        async with asyncio.timeout(LIMIT / 4):
+            with pytest.raises(ServiceUnavailable):
+                await session.call(ECHO, "/echo", wait=False, timeout=None)
+        await server.serve("/echo")
+        await session.wait_for_service(ECHO, "/echo", timeout=LIMIT)
+        await check_call(session, "/echo", "there", wait=False)
+        await server.stop("/echo")
+        await until(lambda: not session.service_is_ready(ECHO, "/echo"))
+        with pytest.raises(ServiceUnavailable):
+            await session.call(ECHO, "/echo", wait=False, timeout=None)
+        await assert_clean(session)
+
+
+class TestAppearing:
+    """A server that starts after the call does."""
+
+    async def test_the_waiting_call_is_sent_when_it_appears(
+        self, session: Session, server: ServerProcess
+    ) -> None:
+        calls = [session.start(ECHO, "/echo", request_of(str(n)), timeout=LIMIT) for n in range(30)]
+        watch = asyncio.create_task(session.wait_for_service(ECHO, "/echo"))
+        await asyncio.sleep(2 * TICK)
+        assert not any(task.done() for task in (*calls, watch))
+        await server.serve("/echo")
+        await watch
+        assert [answer_to(await task) for task in calls] == [str(n) for n in range(30)]
+        assert await server.received("/echo") == [str(n) for n in range(30)]
+        assert session.pool.statistics().created == 1
+
+    async def test_another_type_of_the_name_is_not_it(
+        self, session: Session, server: ServerProcess
+    ) -> None:
+        await server.serve("/enable", "std_srvs/srv/SetBool")
+        task = session.start("std_srvs/srv/Trigger", "/enable", timeout=LIMIT)
+        await seen(session, "/enable")
+        await asyncio.sleep(2 * TICK)
+        assert not task.done()
+        await server.stop("/enable")
+        async with ServerProcess() as other:
+            await other.serve("/enable", "std_srvs/srv/Trigger")
+            assert (await task).success
+            await session.aclose()
+
+    async def test_the_first_call_of_many_new_sessions_is_answered(
+        self, bridge: Bridge, echo: str
+    ) -> None:
+        """The first response after "ready" is what others lose."""
+        for number in range(5):
+            async with Session("brief", bridge=bridge) as session:
+                await check_call(session, echo, str(number))
+
+
+class TestSeveralServers:
+    """Two servers of one name: both run every request."""
+
+    async def test_a_warning_once_for_each_name(
+        self, session: Session, server: ServerProcess, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        await server.serve("/twins", copies=2)
+        await server.serve("/triplets", copies=3)
+        await server.serve("/single")
+        for name in ("/twins", "/triplets", "/single"):
+            expected = {"/twins": 2, "/triplets": 3}.get(name, 1)
+            await until(
+                lambda name=name, n=expected: session.node.count_services(name) == n  # type: ignore[misc]
+            )
+            for number in range(5):
+                await check_call(session, name, str(number))
+        warnings = [
+            record.getMessage()
+            for record in caplog.records
+            if record.name.startswith("rosasync") and record.levelno == logging.WARNING
+        ]
+        assert len(warnings) == 2, warnings
+        assert "/twins" in warnings[0]
+        assert "/triplets" in warnings[1]
+        await server.answered("/triplets", 15)
+        await assert_clean(session)
+
+    async def test_one_that_comes_later_is_warned_of(
+        self, session: Session, server: ServerProcess, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        await server.serve("/echo")
+        await check_call(session, "/echo", "one")
+        assert not caplog.records
+        await server.serve("/echo")
+        await until(lambda: session.node.count_services("/echo") == 2)
+        for number in range(5):
+            await check_call(session, "/echo", str(number))
+        await until(lambda: any("/echo" in record.getMessage() for record in caplog.records))
