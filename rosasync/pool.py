@@ -133,11 +133,18 @@ class ClientPool:
     between awaits, so there is no lock.
     """
 
-    def __init__(self, node: NodePort, limits: Limits, timeout: float | None = None) -> None:
+    def __init__(
+        self,
+        node: NodePort,
+        limits: Limits,
+        timeout: float | None,
+        on_shutdown: Callable[[], object],
+    ) -> None:
         self._loop = asyncio.get_running_loop()
         self._node = node
         self._limits = limits
         self._timeout = timeout
+        self._on_shutdown = on_shutdown
         self._opened = self._loop.time()
         self._endpoints: dict[ServiceKey, Endpoint] = {}
         self._shortcuts: dict[tuple[Any, str, Any], Endpoint] = {}
@@ -309,6 +316,8 @@ class ClientPool:
 
     def graph_changed(self) -> None:
         """Look who is affected by a change of the ROS graph."""
+        if self._ending is not None:
+            return
         self._graph += 1
         self._look()
         if any(self._awaits_match(endpoint) for endpoint in self._endpoints.values()):
@@ -571,31 +580,34 @@ class ClientPool:
 
     def _look_soon(self) -> None:
         """Look every few milliseconds at first: the match itself is not an event of the graph."""
-        if self._look_timer is not None:
-            self._look_timer.cancel()
         self._look_delay = FIRST_LOOK
-        self._look_timer = self._loop.call_later(FIRST_LOOK, self._on_look_timer)
+        self._look_in(FIRST_LOOK)
 
     def _keep_looking(self) -> None:
         """Look at the context now and then, until a look finds that nothing is out."""
         if not self._node.graph_events:
             self._graph += 1
-        self._look_timer = self._loop.call_later(CONTEXT_LOOK, self._on_look_timer)
+        self._look_in(CONTEXT_LOOK)
+
+    def _look_in(self, delay: float) -> None:
+        if self._look_timer is not None:
+            self._look_timer.cancel()
+        self._look_timer = self._loop.call_later(delay, self._on_look_timer)
 
     def _on_look_timer(self) -> None:
-        self._look_timer = None
         if not self._node.ok():
-            self.end(_context_shut_down)
+            self._on_shutdown()
             return
         if not self._node.graph_events:
             self._graph += 1
         self._look()
+        self._look_timer = None
         endpoints = self._endpoints.values()
         if any(self._awaits_match(endpoint) for endpoint in endpoints):
             self._look_delay = min(self._look_delay * 2, LAST_LOOK)
-            self._look_timer = self._loop.call_later(self._look_delay, self._on_look_timer)
+            self._look_in(self._look_delay)
         elif any(endpoint.is_busy for endpoint in endpoints):
-            self._look_timer = self._loop.call_later(CONTEXT_LOOK, self._on_look_timer)
+            self._look_in(CONTEXT_LOOK)
 
     def _look(self) -> None:
         for endpoint in self._endpoints.values():
@@ -655,7 +667,7 @@ class ClientPool:
             message = "the last server vanished while the request was out"
             error = endpoint.error(ServerGone, message, elapsed)
         elif not isinstance(error, asyncio.CancelledError | RosasyncError) and not self._node.ok():
-            error = self._ending() if self._ending is not None else _context_shut_down()
+            error = self._ending() if self._ending is not None else context_shut_down()
         if isinstance(error, asyncio.CancelledError):
             counts.cancelled += 1
         elif isinstance(error, TimeoutError):
@@ -707,7 +719,8 @@ class _Gone(Exception):
     """The last server vanished."""
 
 
-def _context_shut_down() -> Exception:
+def context_shut_down() -> Exception:
+    """Make the error that everybody gets when the context goes down."""
     return ContextShutdown("the rclpy context was shut down, or the node destroyed")
 
 
