@@ -1,0 +1,102 @@
+"""Coroutines that begin at once: what runs when, and that cancellation reaches them."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+
+import pytest
+
+from rosasync.eager import begin
+
+pytestmark = pytest.mark.asyncio(loop_factories=["asyncio", "uvloop"])
+
+
+class Work:
+    """Waits for a future, then for a turn, and writes down how far it came."""
+
+    def __init__(self) -> None:
+        self.loop = asyncio.get_running_loop()
+        self.future: asyncio.Future[str] = self.loop.create_future()
+        self.steps: list[str] = []
+
+    async def run(self) -> None:
+        self.steps.append("begun")
+        try:
+            self.steps.append(await self.future)
+            await asyncio.sleep(0)
+            self.steps.append("ended")
+        except BaseException as error:
+            self.steps.append(type(error).__name__)
+            raise
+        finally:
+            self.steps.append("left")
+
+
+async def test_it_runs_to_its_first_wait_at_once_and_goes_on_later() -> None:
+    work = Work()
+    task = begin(work.loop, work.run())
+    assert work.steps == ["begun"]
+    assert task is not None
+    work.future.set_result("answered")
+    assert work.steps == ["begun"]
+    await task
+    assert work.steps == ["begun", "answered", "ended", "left"]
+
+
+async def test_what_never_waits_needs_no_task() -> None:
+    steps: list[str] = []
+
+    async def run() -> None:
+        steps.append("begun")
+
+    assert begin(asyncio.get_running_loop(), run()) is None
+    assert steps == ["begun"]
+
+
+async def test_it_may_wait_for_nothing_but_its_turn() -> None:
+    steps: list[str] = []
+
+    async def run() -> None:
+        for _ in range(2):
+            await asyncio.sleep(0)
+        steps.append("ended")
+
+    task = begin(asyncio.get_running_loop(), run())
+    assert task is not None
+    await task
+    assert steps == ["ended"]
+
+
+async def no_turn() -> None:
+    """The cancellation comes in the turn in which the work began."""
+
+
+async def some_turns() -> None:
+    for _ in range(3):
+        await asyncio.sleep(0)
+
+
+@pytest.mark.parametrize("wait", [no_turn, some_turns])
+async def test_a_cancellation_in_a_later_turn_reaches_it(
+    wait: Callable[[], Awaitable[None]],
+) -> None:
+    work = Work()
+    task = begin(work.loop, work.run())
+    assert task is not None
+    await wait()
+    work.loop.call_soon(task.cancel)
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    assert work.steps == ["begun", "CancelledError", "left"]
+    assert work.future.cancelled()
+
+
+async def test_an_error_reaches_it_and_the_task() -> None:
+    work = Work()
+    task = begin(work.loop, work.run())
+    assert task is not None
+    work.future.set_exception(ValueError("no"))
+    with pytest.raises(ValueError, match="no"):
+        await task
+    assert work.steps == ["begun", "ValueError", "left"]
