@@ -1,0 +1,338 @@
+"""Behaviours for py_trees that call services without ever blocking a tick (extra ``py-trees``).
+
+Ticked in the loop, with an ``await`` between ticks, or in a thread of the tree's own, with
+``tree.tick_tock``::
+
+    root = py_trees.composites.Sequence("fetch", memory=True, children=[
+        WaitForService("arm there?", SetBool, "/arm/enable", timeout=5.0),
+        CallService("enable arm", SetBool, "/arm/enable", {"data": True}, timeout=2.0),
+    ])
+    tree = py_trees.trees.BehaviourTree(root)
+    tree.setup(session=session)
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from rosasync.errors import UsageError
+from rosasync.limits import check_timeout
+from rosasync.proxy import AsyncServiceProxy, ProxyState
+
+try:
+    from py_trees.behaviour import Behaviour
+    from py_trees.common import Access, Status
+except ImportError as error:
+    raise ImportError(
+        f"rosasync.behaviours needs py_trees, which does not import here ({error}): "
+        "pip install 'rosasync[py-trees]'"
+    ) from error
+
+if TYPE_CHECKING:
+    from rosasync.session import Session
+
+__all__ = ["CallService", "FromBlackboard", "FromConstant", "WaitForService"]
+
+
+class ServiceBehaviour(Behaviour):  # type: ignore[misc]
+    """What both behaviours share: a proxy from setup to shutdown."""
+
+    def __init__(
+        self, name: str, srv_type: Any, srv_name: str, qos: Any, session: Session | None
+    ) -> None:
+        super().__init__(name)
+        self.srv_type = srv_type
+        self.srv_name = srv_name
+        self._qos = qos
+        self._session = session
+        self._proxy: AsyncServiceProxy | None = None
+
+    def setup(self, **kwargs: Any) -> None:
+        """Take the session, from the constructor or ``tree.setup(session=…)``; never blocks.
+
+        Raises:
+            KeyError: neither gave one.
+            TypeError, ValueError: there is no such service type, or that is no QoS.
+            InvalidServiceName: ROS does not allow the name.
+            SessionClosed: the session is closed.
+        """
+        session = self._session or kwargs.get("session")
+        if session is None:
+            raise KeyError(f"{self.qualified_name}: no 'session' in setup's keyword arguments")
+        self.shutdown()
+        self._proxy = AsyncServiceProxy(session, self.srv_type, self.srv_name, qos=self._qos)
+
+    def terminate(self, new_status: Status) -> None:
+        """Cancel what is under way, where the behaviour is interrupted."""
+        if new_status is Status.INVALID and self._proxy is not None:
+            self._proxy.stop_call()
+
+    def shutdown(self) -> None:
+        """Cancel what is under way, for good; another `setup` begins anew."""
+        if self._proxy is not None:
+            self._proxy.shutdown()
+            self._proxy = None
+
+    @property
+    def proxy(self) -> AsyncServiceProxy:
+        """The proxy, from setup to shutdown.
+
+        Raises:
+            UsageError: before or after these.
+        """
+        if self._proxy is None:
+            raise UsageError(f"{self.qualified_name} was not set up: tree.setup(session=session)")
+        return self._proxy
+
+
+class CallService(ServiceBehaviour):
+    """Calls a service once in each run: RUNNING until the answer is there.
+
+    SUCCESS with the answer; FAILURE where the call failed, the deadline passed, or the request
+    was not to be had. Interrupted, it cancels the call. A new run never sees an older answer: it
+    unsets the blackboard's response and error before it calls.
+
+    Args:
+        name: of the behaviour.
+        srv_type: a service class or its name, ``"std_srvs/srv/SetBool"``.
+        srv_name: the service's name.
+        request: a message, a mapping of its fields, or None for an empty one; or a function that
+            returns one of these, called at the beginning of each run.
+        key_request: the blackboard variable to take the request from, in place of ``request``; may
+            be nested (``goal.request``).
+        key_response: the blackboard variable for the response.
+        key_error: the blackboard variable for the exception a run failed with.
+        key_feedback_message: the blackboard variable for the feedback message.
+        on_response: takes the response, and may return the status to end with.
+        on_error: takes the exception, and may return the status to end with.
+        on_feedback: takes the feedback message whenever there is a new one.
+        timeout: seconds for the whole call; None for the session's, ``math.inf`` for no deadline.
+        wait: False to fail at once where no server is there, instead of waiting for one.
+        qos: a ``QoSProfile``; None for the service default with a history of 1,000.
+        session: the session; None to take it from ``tree.setup(session=…)``.
+
+    Raises:
+        TypeError: both a request and a key for it.
+        TypeError, ValueError: the timeout is no number, or negative.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        srv_type: Any,
+        srv_name: str,
+        request: Any = None,
+        *,
+        key_request: str | None = None,
+        key_response: str | None = None,
+        key_error: str | None = None,
+        key_feedback_message: str | None = None,
+        on_response: Callable[[Any], Status | None] | None = None,
+        on_error: Callable[[Exception], Status | None] | None = None,
+        on_feedback: Callable[[str], object] | None = None,
+        timeout: float | None = None,
+        wait: bool = True,
+        qos: Any = None,
+        session: Session | None = None,
+    ) -> None:
+        super().__init__(name, srv_type, srv_name, qos, session)
+        if request is not None and key_request is not None:
+            raise TypeError("the request is given, or taken from key_request, not both")
+        check_timeout(timeout, None)
+        self._request = request
+        self._timeout = timeout
+        self._wait = wait
+        self._refusal: Exception | None = None
+        self._on_response = on_response
+        self._on_error = on_error
+        self._on_feedback = on_feedback
+        self._key_request = key_request
+        self._key_response = key_response
+        self._key_error = key_error
+        self._key_feedback_message = key_feedback_message
+        self.blackboard = self.attach_blackboard_client()
+        self._register(Access.READ, key_request)
+        self._register(Access.WRITE, key_response, key_error, key_feedback_message)
+
+    def setup(self, **kwargs: Any) -> None:
+        """Take the session and look at the request, where it is a constant; never blocks.
+
+        Raises:
+            KeyError: there is no session.
+            TypeError, ValueError: service type, QoS or a constant request do not fit.
+            InvalidServiceName: ROS does not allow the name.
+            SessionClosed: the session is closed.
+        """
+        super().setup(**kwargs)
+        if not callable(self._request) and self._key_request is None:
+            self._request = self.proxy.request(self._request)
+
+    def initialise(self) -> None:
+        """Start the call."""
+        proxy = self.proxy
+        proxy.stop_call()
+        self._refusal = None
+        self._unset(self._key_response)
+        self._unset(self._key_error)
+        request = self._request() if callable(self._request) else self._request
+        try:
+            if self._key_request is not None:
+                request = self.blackboard.get(self._key_request)
+            proxy.call_service(request, self._timeout, wait=self._wait)
+        except (KeyError, TypeError, ValueError) as error:
+            self._refusal = error
+            self.logger.error(f"{self.qualified_name}: no request for {self.srv_name}: {error}")
+        else:
+            self._tell(f"calling {self.srv_name}")
+
+    def update(self) -> Status:
+        """Look what became of the call."""
+        proxy = self.proxy
+        state = proxy.get_state()
+        if state is ProxyState.RUNNING:
+            return Status.RUNNING
+        if self._refusal is not None:
+            return self._failed(self._refusal)
+        if state is ProxyState.RESPONSE_READY:
+            return self._answered(proxy.get_response())
+        for error in proxy.get_errors():
+            return self._failed(error)
+        self._tell(f"{self.srv_name}: aborted")
+        return Status.FAILURE
+
+    def _answered(self, response: Any) -> Status:
+        self._tell(f"{self.srv_name} answered")
+        self._set(self._key_response, response)
+        status = None if self._on_response is None else self._on_response(response)
+        return Status.SUCCESS if status is None else status
+
+    def _failed(self, error: Exception) -> Status:
+        self._tell(str(error))
+        self._set(self._key_error, error)
+        status = None if self._on_error is None else self._on_error(error)
+        return Status.FAILURE if status is None else status
+
+    def _tell(self, message: str) -> None:
+        self.feedback_message = message
+        self._set(self._key_feedback_message, message)
+        if self._on_feedback is not None:
+            self._on_feedback(message)
+
+    def _register(self, access: Access, *names: str | None) -> None:
+        for name in names:
+            if name is not None:
+                self.blackboard.register_key(key=name.split(".")[0], access=access)
+
+    def _set(self, name: str | None, value: Any) -> None:
+        if name is not None:
+            self.blackboard.set(name, value)
+
+    def _unset(self, name: str | None) -> None:
+        if name is None:
+            return
+        if "." not in name:
+            self.blackboard.unset(name)
+            return
+        # An attribute of somebody's object, which may not be there yet.
+        with contextlib.suppress(KeyError):
+            self.blackboard.set(name, None)
+
+
+class FromBlackboard(CallService):
+    """`CallService` with the request from the blackboard, as in ``py_trees_ros``.
+
+    Where the variable is not there, the run ends in FAILURE.
+
+    Args:
+        name: of the behaviour.
+        srv_type: a service class or its name.
+        srv_name: the service's name.
+        key_request: the blackboard variable to take the request from; may be nested.
+        key_response: the blackboard variable for the response.
+        options: the other keyword arguments of `CallService`.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        srv_type: Any,
+        srv_name: str,
+        key_request: str,
+        key_response: str | None = None,
+        **options: Any,
+    ) -> None:
+        super().__init__(
+            name, srv_type, srv_name, key_request=key_request, key_response=key_response, **options
+        )
+
+
+class FromConstant(CallService):
+    """`CallService` with a constant request, as in ``py_trees_ros``.
+
+    Args:
+        name: of the behaviour.
+        srv_type: a service class or its name.
+        srv_name: the service's name.
+        request: a message, a mapping of its fields, or None for an empty one.
+        key_response: the blackboard variable for the response.
+        options: the other keyword arguments of `CallService`.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        srv_type: Any,
+        srv_name: str,
+        request: Any,
+        key_response: str | None = None,
+        **options: Any,
+    ) -> None:
+        super().__init__(name, srv_type, srv_name, request, key_response=key_response, **options)
+
+
+class WaitForService(ServiceBehaviour):
+    """Waits for a server: RUNNING until one is there, then SUCCESS; FAILURE at the deadline.
+
+    Args:
+        name: of the behaviour.
+        srv_type: a service class or its name.
+        srv_name: the service's name.
+        timeout: seconds, None for no deadline.
+        qos: a ``QoSProfile``; None for the service default with a history of 1,000.
+        session: the session; None to take it from ``tree.setup(session=…)``.
+
+    Raises:
+        TypeError, ValueError: the timeout is no number, or negative.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        srv_type: Any,
+        srv_name: str,
+        *,
+        timeout: float | None = None,
+        qos: Any = None,
+        session: Session | None = None,
+    ) -> None:
+        super().__init__(name, srv_type, srv_name, qos, session)
+        self._timeout = check_timeout(timeout, None)
+
+    def initialise(self) -> None:
+        """Start to wait."""
+        self.proxy.wait_for_service(self._timeout)
+        self.feedback_message = f"waiting for {self.srv_name}"
+
+    def update(self) -> Status:
+        """Look whether a server is there."""
+        proxy = self.proxy
+        state = proxy.get_state()
+        if state is ProxyState.WAITING:
+            return Status.RUNNING
+        if state is ProxyState.SERVICE_AVAILABLE:
+            self.feedback_message = f"{self.srv_name} is there"
+            return Status.SUCCESS
+        self.feedback_message = "; ".join(map(str, proxy.get_errors())) or "aborted"
+        return Status.FAILURE
