@@ -21,13 +21,18 @@ from rosasync.limits import (
     Limits,
     PoolStatistics,
     Retry,
+    ServerStatistics,
     ServiceKey,
     SessionStatistics,
 )
 from rosasync.pool import ClientPool, LeasedClient
+from rosasync.portal import Portal
+from rosasync.proxy import AsyncServiceProxy, ProxyState
+from rosasync.server import RequestInfo, ServiceCall, ServiceServer
 from rosasync.session import ServiceClient, Session
 
 __all__ = [
+    "AsyncServiceProxy",
     "CallError",
     "ClientPool",
     "ContextShutdown",
@@ -37,13 +42,19 @@ __all__ = [
     "Limits",
     "PoolFull",
     "PoolStatistics",
+    "Portal",
+    "ProxyState",
     "QueueTimeout",
+    "RequestInfo",
     "ResponseTimeout",
     "Retry",
     "RosasyncError",
     "ServerGone",
+    "ServerStatistics",
+    "ServiceCall",
     "ServiceClient",
     "ServiceKey",
+    "ServiceServer",
     "ServiceUnavailable",
     "Session",
     "SessionClosed",

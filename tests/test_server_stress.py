@@ -1,0 +1,236 @@
+"""Servers under load: bursts, threads that answer, closing and opening again under calls."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import queue
+import random
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from rosasync import ServiceCall, Session, SessionClosed
+from tests.support.checks import count_descriptors, count_threads
+from tests.support.clients import ClientProcess
+from tests.support.echo import ECHO
+from tests.support.serving import FORMS, ask, echo_of, serving, settled
+from tests.support.times import LIMIT, TICK, until
+
+if TYPE_CHECKING:
+    pass
+
+numbers = itertools.count()
+
+CLIENTS = 50
+PROCESSES = 4
+EACH = 10
+
+
+@pytest.fixture(scope="module")
+def crowd() -> Iterator[list[ClientProcess]]:
+    """Four processes of stock clients."""
+    with ExitStack() as stack:
+        yield [stack.enter_context(ClientProcess()) for _ in range(PROCESSES)]
+
+
+@pytest.fixture
+def name() -> str:
+    """A name of this test alone: clients made now may still know the servers of the last one."""
+    return f"/stressed_{next(numbers)}"
+
+
+async def burst(
+    crowd: list[ClientProcess], name: str, timeout: float = LIMIT, **options: Any
+) -> dict[str, int]:
+    """Have 50 clients in four processes make ten calls each, all at once."""
+    shares = [len(range(number, CLIENTS, PROCESSES)) for number in range(PROCESSES)]
+    for process, clients in zip(crowd, shares, strict=True):
+        await process.start(name, EACH, clients=clients, in_flight=EACH, timeout=timeout, **options)
+    tallies = [await process.result() for process in crowd]
+    return {
+        "answered": sum(tally.answered for tally in tallies),
+        "wrong": sum(tally.wrong for tally in tallies),
+        "lost": sum(tally.lost for tally in tallies),
+    }
+
+
+async def join(process: ClientProcess, name: str, seen: set[str], **options: Any) -> None:
+    """Have a process call on and on, and wait until a call of its own arrives."""
+    await process.start(name, None, in_flight=EACH, depth=1000, **options)
+    await until(lambda: str(process.pid) in seen)
+
+
+def caller_of(request: Any) -> str:
+    """The process that sent a request: its clients begin every text with its id."""
+    return str(request.load_namespace).partition("-")[0]
+
+
+@pytest.mark.parametrize("form", ["async, request and response", "plain, call", "iteration"])
+async def test_a_burst_of_500_requests_is_answered(
+    session: Session, crowd: list[ClientProcess], name: str, form: str
+) -> None:
+    async with serving(session, name, form) as server:
+        result = await burst(crowd, name, depth=1000)
+        assert result == {"answered": CLIENTS * EACH, "wrong": 0, "lost": 0}
+        await settled(server)
+        assert server.statistics().taken == server.statistics().responded == CLIENTS * EACH
+
+
+async def test_a_burst_of_stock_clients_is_taken_and_answered(
+    session: Session, crowd: list[ClientProcess], name: str
+) -> None:
+    """What their own queues of ten then lose of the answers is not the server's."""
+    async with serving(session, name, "async, request and response") as server:
+        result = await burst(crowd, name, timeout=20 * TICK)
+        assert result["wrong"] == 0
+        assert result["answered"] + result["lost"] == CLIENTS * EACH
+        await settled(server)
+        statistics = server.statistics()
+        assert statistics.taken == statistics.responded == CLIENTS * EACH
+        assert statistics.rejected == statistics.dropped == statistics.undeliverable == 0
+
+
+class Answerers:
+    """Four threads that answer what they are given, in a shuffled order."""
+
+    def __init__(self) -> None:
+        self.refused = 0
+        self.seen: set[str] = set()
+        self.calls: queue.SimpleQueue[ServiceCall | None] = queue.SimpleQueue()
+        self._chance = random.Random(5)
+        self._lock = threading.Lock()
+        self._threads = [threading.Thread(target=self._answer) for _ in range(4)]
+
+    @contextmanager
+    def working(self) -> Iterator[None]:
+        for thread in self._threads:
+            thread.start()
+        try:
+            yield
+        finally:
+            for _ in self._threads:
+                self.calls.put(None)
+            for thread in self._threads:
+                thread.join()
+
+    def take(self, call: ServiceCall) -> None:
+        """The handler."""
+        self.seen.add(caller_of(call.request))
+        self.calls.put(call)
+
+    def _answer(self) -> None:
+        held: list[ServiceCall] = []
+        while True:
+            try:
+                call = self.calls.get(timeout=TICK / 10)
+            except queue.Empty:
+                pass
+            else:
+                if call is None:
+                    break
+                held.append(call)
+                if len(held) < 20:
+                    continue
+            self._answer_all(held)
+        self._answer_all(held)
+
+    def _answer_all(self, held: list[ServiceCall]) -> None:
+        self._chance.shuffle(held)
+        while held:
+            call = held.pop()
+            try:
+                call.respond(echo_of(call.request))
+            except SessionClosed:
+                with self._lock:
+                    self.refused += 1
+
+
+async def test_a_thousand_answers_from_four_threads(
+    session: Session, crowd: list[ClientProcess], name: str
+) -> None:
+    answerers = Answerers()
+    with answerers.working():
+        async with session.serve(ECHO, name, answerers.take) as server:
+            for process in crowd:
+                await process.start(name, 50, clients=5, in_flight=EACH, depth=1000)
+            for process in crowd:
+                tally = await process.result()
+                assert (tally.answered, tally.wrong, tally.lost) == (250, 0, 0)
+            await settled(server)
+            statistics = server.statistics()
+            assert statistics.taken == statistics.responded == 1000
+            assert answerers.refused == statistics.dropped == 0
+
+
+@pytest.mark.parametrize("round_", range(3))
+async def test_the_server_closes_while_four_threads_answer(
+    session: Session, crowd: list[ClientProcess], name: str, round_: int
+) -> None:
+    answerers = Answerers()
+    with answerers.working():
+        server = session.serve(ECHO, name, answerers.take)
+        for process in crowd:
+            await join(process, name, answerers.seen, clients=5, timeout=10 * TICK)
+        answered = server.statistics().responded
+        await until(lambda: server.statistics().responded > answered + 1000)
+        await server.aclose()
+    statistics = server.statistics()
+    assert statistics.taken == statistics.responded + statistics.dropped
+    assert answerers.refused == statistics.dropped
+    tallies = [await process.result() for process in crowd]
+    assert sum(tally.wrong for tally in tallies) == 0
+    assert 1000 < sum(tally.answered for tally in tallies) <= statistics.responded
+
+
+async def test_closed_and_opened_again_200_times(
+    session: Session, crowd: list[ClientProcess]
+) -> None:
+    seen: set[str] = set()
+
+    async def handler(call: ServiceCall) -> Any:
+        seen.add(caller_of(call.request))
+        await asyncio.sleep(0)
+        return echo_of(call.request)
+
+    async def cycle(*, foreign: bool = False) -> None:
+        async with session.serve(ECHO, "/reopened", handler):
+            seen.clear()
+            await ask(session, "/reopened", "own", timeout=LIMIT)
+            await until(lambda: not foreign or seen > {"own"})
+
+    for _ in range(20):
+        await cycle()
+    async with session.serve(ECHO, "/reopened", handler):
+        for process in crowd:
+            await join(process, "/reopened", seen, timeout=TICK)
+    before = count_threads(), count_descriptors()
+    for number in range(200):
+        await cycle(foreign=number % 20 == 0)
+    assert count_threads() <= before[0]
+    assert count_descriptors() <= before[1]
+    for process in crowd:
+        tally = await process.result()
+        assert tally.wrong == 0
+        assert tally.calls > 0
+    assert session.statistics().servers == ()
+    assert len([s for s in session.node.services if s.srv_name == "/reopened"]) == 0
+
+
+async def test_100_calls_through_a_chain_of_servers(session: Session) -> None:
+    def link(number: int) -> Any:
+        async def handler(call: ServiceCall) -> Any:
+            return await session.call(ECHO, f"/link_{number + 1}", call.request)
+
+        return handler
+
+    servers = [session.serve(ECHO, f"/link_{number}", link(number)) for number in range(4)]
+    servers.append(session.serve(ECHO, "/link_4", FORMS["plain, call"]))
+    texts = [str(number) for number in range(100)]
+    assert await asyncio.gather(*(ask(session, "/link_0", text) for text in texts)) == texts
+    for server in servers:
+        await settled(server)
+        assert server.statistics().responded == 100
