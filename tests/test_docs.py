@@ -17,6 +17,7 @@ PRINTS = {
     "by_name": "the lamp is off\n",
     "exclusive": "the lamp is on\nthe lamp is off\n1 client, 2 calls\n",
     "first_call": "the lamp is on\n",
+    "serve": "the lamp is off\n",
 }
 
 
