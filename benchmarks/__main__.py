@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from json import dumps
 from pathlib import Path
 from typing import Annotated
 
@@ -19,7 +20,7 @@ from rosasync.ros.domain import isolate
 
 ROUNDS, QUICK_ROUNDS = 9, 5
 PINNED_CORES = 4
-WIDTH = 150
+WIDTH = 180
 
 Quick = Annotated[bool, typer.Option("--quick", help="Fewer calls and rounds.")]
 Rounds = Annotated[int | None, typer.Option(min=1, help=f"{ROUNDS}, or {QUICK_ROUNDS} if quick.")]
@@ -40,7 +41,7 @@ def latency(
     contestants: Chosen = "",
     pin: Pin = None,
 ) -> None:
-    """Time of a call, calls at once, idle clients, idle CPU and memory: the targets."""
+    """Time of a call, calls at once, idle clients, idle CPU and memory."""
     measure(["latency"], quick, rounds, json, contestants, pin)
 
 
@@ -69,6 +70,66 @@ def scale(
 
 
 @app.command()
+def hosts(
+    quick: Quick = False,
+    rounds: Rounds = None,
+    json: Json = None,
+    contestants: Chosen = "",
+    pin: Pin = None,
+) -> None:
+    """A server on another host, a network namespace; needs root."""
+    measure(["hosts"], quick, rounds, json, contestants, pin)
+
+
+@app.command()
+def targets(
+    quick: Quick = False,
+    rounds: Rounds = None,
+    json: Json = None,
+    contestants: Chosen = "",
+    pin: Pin = None,
+) -> None:
+    """The least of everything that shows whether the targets are reached."""
+    measure(["targets"], quick, rounds, json, contestants, pin)
+
+
+@app.command()
+def ticks(
+    quick: Quick = False,
+    rounds: Rounds = None,
+    json: Json = None,
+    contestants: Chosen = "",
+    pin: Pin = None,
+) -> None:
+    """Ticks of behaviour trees: what they cost, and how soon they send and see."""
+    measure(["ticks"], quick, rounds, json, contestants, pin)
+
+
+@app.command()
+def flood(
+    quick: Quick = False,
+    rounds: Rounds = None,
+    json: Json = None,
+    contestants: Chosen = "",
+    pin: Pin = None,
+) -> None:
+    """Calls lost by a busy client while another process floods its server."""
+    measure(["flood"], quick, rounds, json, contestants, pin)
+
+
+@app.command()
+def servers(
+    quick: Quick = False,
+    rounds: Rounds = None,
+    json: Json = None,
+    contestants: Chosen = "",
+    pin: Pin = None,
+) -> None:
+    """A rosasync server beside a stock one, driven by the same client."""
+    measure(["servers"], quick, rounds, json, contestants, pin)
+
+
+@app.command()
 def idle(
     quick: Quick = False,
     rounds: Rounds = None,
@@ -92,6 +153,22 @@ def memory(
     measure(["memory"], quick, rounds, json, contestants, pin)
 
 
+@app.command()
+def allocations(quick: Quick = False, json: Json = None) -> None:
+    """Python objects and bytes of a call and of a request, and what stays of many."""
+    from benchmarks.allocations import measure_allocations, show_allocations
+
+    isolate()
+    console = make_console()
+    with Progress(console=console) as progress:
+        found = measure_allocations(quick=quick, progress=progress)
+    for table in show_allocations(found):
+        console.print(table)
+    if json:
+        json.parent.mkdir(parents=True, exist_ok=True)
+        json.write_text(dumps({"machine": describe_machine(), "allocations": found}))
+
+
 @app.command("all")
 def everything(
     quick: Quick = False,
@@ -101,7 +178,26 @@ def everything(
     pin: Pin = None,
 ) -> None:
     """Everything there is to measure."""
-    measure(list(SUITES), quick, rounds, json, contestants, pin)
+    measure([name for name in SUITES if name != "targets"], quick, rounds, json, contestants, pin)
+
+
+@app.command()
+def profile(
+    calls: Annotated[int, typer.Option(min=250, help="With the stamps, and as many without.")] = (
+        20_000
+    ),
+    update: Annotated[
+        Path | None, typer.Option(exists=True, help="A page to write the table into.")
+    ] = None,
+) -> None:
+    """Where the time of one call goes, between await and its answer."""
+    from benchmarks import profile
+
+    isolate()
+    found = profile.profile(calls)
+    make_console().print(profile.table(found))
+    if update:
+        update.write_text(profile.updated(update.read_text(), found, describe_machine()))
 
 
 @app.command()

@@ -19,6 +19,8 @@ class Metric:
 
     label: str
     of: Callable[[Turn], float | None]
+    over: Callable[[list[float]], float] = statistics.median
+    """Makes one figure of the rounds'."""
 
 
 def _percentile(q: float) -> Callable[[Turn], float | None]:
@@ -31,6 +33,12 @@ def _per_call(turn: Turn, amount: float) -> float | None:
 
 def _rate(turn: Turn) -> float | None:
     return len(turn.samples) / turn.elapsed * 1e9 if turn.elapsed else None
+
+
+def _lost(turn: Turn) -> float | None:
+    missed = turn.lost + turn.failed
+    calls = missed + len(turn.samples)
+    return missed / calls * 100 if calls else None
 
 
 def _server_cpu(turn: Turn) -> float | None:
@@ -47,6 +55,9 @@ METRICS = {
     "switches": Metric(
         "switches", lambda t: _per_call(t, t.client.voluntary + t.client.involuntary)
     ),
+    "lost": Metric("lost %", _lost, max),
+    "threads": Metric("threads", lambda t: t.added.get("threads")),
+    "descriptors": Metric("descriptors", lambda t: t.added.get("descriptors")),
     "share": Metric("CPU %", lambda t: t.client.cpu / t.elapsed * 100 if t.elapsed else None),
     "growth": Metric(
         "growth MB", lambda t: (t.memory[-1] - t.memory[0]) / 1e6 if t.memory else None
@@ -75,10 +86,12 @@ def brief(value: float) -> str:
 
 
 def figure(turns: Iterable[Turn], metric: str) -> float | None:
-    """The median over the rounds."""
-    of = METRICS[metric].of
-    values = [value for turn in turns if turn.outcome == "ok" and (value := of(turn)) is not None]
-    return statistics.median(values) if values else None
+    """The median over the rounds; of what may not happen at all, the most."""
+    found = METRICS[metric]
+    values = [
+        value for turn in turns if turn.outcome == "ok" and (value := found.of(turn)) is not None
+    ]
+    return found.over(values) if values else None
 
 
 def pooled_percentile(turns: Iterable[Turn], q: float) -> float | None:

@@ -13,7 +13,7 @@ import tempfile
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
@@ -35,13 +35,28 @@ class Hung(ChildError):
 
 
 class Child:
-    """A Python module run as a process of its own, asked for one thing at a time."""
+    """A Python module run as a process of its own, asked for one thing at a time.
 
-    def __init__(self, module: str, *args: str, cores: set[int] | None = None) -> None:
+    Args:
+        module: run with ``python -m``, and `args`.
+        cores: it is bound to these.
+        prefix: the command it is run by.
+        environment: of its own, above this process's.
+    """
+
+    def __init__(
+        self,
+        module: str,
+        *args: str,
+        cores: set[int] | None = None,
+        prefix: Sequence[str] = (),
+        environment: Mapping[str, str] | None = None,
+    ) -> None:
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the child
         # A session of its own: Ctrl-C is the parent's to handle, and a kill reaches grandchildren.
         self._process = subprocess.Popen(
-            [sys.executable, "-m", module, *args],
+            [*prefix, sys.executable, "-m", module, *args],
+            env={**os.environ, **(environment or {})},
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._stderr,

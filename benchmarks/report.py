@@ -44,10 +44,12 @@ def write_report(results: Results, out: Path) -> Path:
     sections = [INTRODUCTION, *_machine(results), *_targets(results)]
     plots = write_plots(results, out / "benchmarks")
     for scenario in results.scenarios:
+        what = describe(results.scenarios[scenario])
+        if reason := results.skipped.get(scenario):
+            sections.append(f"## {_title(scenario)}\n\n{_sentence(what)}\nSkipped: {reason}.\n")
         if not results.contestants(scenario):
             continue
         heading, body = rows(results, scenario)
-        what = describe(results.scenarios[scenario])
         sections += [f"## {_title(scenario)}\n\n{_sentence(what)}\n", _markdown(heading, body)]
         if scenario in plots:
             picture = plots[scenario].relative_to(out)
@@ -119,6 +121,8 @@ def _exceeding(axes: Axes, contestants: dict[str, list[Turn]]) -> None:
     """How many calls took longer than a time: the whole distribution, its tail drawn out."""
     for i, turns in enumerate(contestants.values()):
         samples = np.sort(_pooled(turns))
+        if not len(samples):
+            continue
         longer = np.unique(np.geomspace(1, len(samples), POINTS).astype(int))
         axes.plot(samples[-longer], longer / len(samples), color=_color(i), linewidth=1.2)
     axes.set_xscale("log")
@@ -136,6 +140,7 @@ def _rounds(axes: Axes, metric: str, contestants: dict[str, list[Turn]]) -> None
         axes.plot(values, [i + 1] * len(values), "o", alpha=0.7, color=_color(i))
     _name_rows(axes, contestants)
     axes.set_xlim(left=min(0.0, axes.get_xlim()[0]))
+    axes.locator_params(axis="x", nbins=4)
     axes.set_xlabel(f"{figure.label}, a dot for each round")
 
 
@@ -171,11 +176,11 @@ def _machine(results: Results) -> Iterator[str]:
     yield "## Contestants\n"
     used = {turn.contestant for turn in results.turns}
     body = [
-        [f"`{key}`", entry.label, "yes" if entry.spins else ""]
+        [f"`{key}`", entry.label, entry.kind, "yes" if entry.spins else ""]
         for key, entry in CONTESTANTS.items()
         if key in used
     ]
-    yield _markdown(["", "", "burns a core"], body)
+    yield _markdown(["", "", "what it is", "burns a core"], body)
 
 
 def _targets(results: Results) -> Iterator[str]:

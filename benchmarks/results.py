@@ -26,6 +26,7 @@ class Turn:
         problem: what the first failed call of an otherwise good turn raised.
         server: what the server process used meanwhile; None where it was not asked.
         memory: resident bytes, for a scenario that looks at them.
+        added: threads and descriptors, for a scenario that counts them.
     """
 
     scenario: str
@@ -41,6 +42,7 @@ class Turn:
     client: Usage = field(default_factory=Usage)
     server: Usage | None = None
     memory: tuple[int, ...] = ()
+    added: dict[str, int] = field(default_factory=dict)
 
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> Turn:
@@ -64,6 +66,7 @@ class Results:
 
     Attributes:
         scenarios: for each scenario, in the order they ran, what it was: title, group and work.
+        skipped: why a scenario could not be run on this machine.
         settings: how the run was asked for.
     """
 
@@ -71,6 +74,7 @@ class Results:
     settings: dict[str, Any]
     scenarios: dict[str, dict[str, Any]] = field(default_factory=dict)
     turns: list[Turn] = field(default_factory=list)
+    skipped: dict[str, str] = field(default_factory=dict)
 
     def of(self, scenario: str, contestant: str) -> list[Turn]:
         return [t for t in self.turns if (t.scenario, t.contestant) == (scenario, contestant)]
@@ -90,6 +94,7 @@ class Results:
             "settings": self.settings,
             "scenarios": self.scenarios,
             "turns": [turn.to_json() for turn in self.turns],
+            "skipped": self.skipped,
         }
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(data, separators=(",", ":")))
@@ -111,6 +116,7 @@ class Results:
                 merged = cls(data["machine"], data["settings"])
             merged.scenarios |= data["scenarios"]
             merged.turns += turns
+            merged.skipped |= data.get("skipped", {})
         if merged is None:
             raise ValueError("no results to read")
         return merged

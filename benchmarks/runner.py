@@ -5,13 +5,15 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any, Literal
 
 from rich.progress import Progress
 
+from benchmarks.hosts import Hosts, NoHosts
 from benchmarks.meter import Usage
 from benchmarks.pipes import Child, ChildError, Hung
 from benchmarks.results import Results, Turn
@@ -34,9 +36,14 @@ class Scenario:
         key: its name in the results. Scenarios with the same `group` alternate with each other.
         callers: how many call at once.
         calls: calls in one turn, or as many as fit into `seconds`.
-        action: ``call``; ``rest`` for `seconds`; ``soak``, whose length is the worker's.
+        action: ``call``; ``rest`` for `seconds`; ``soak``, whose length is the worker's;
+            ``tick``, with as many leaves as callers.
+        host: where the server is: on the contestants' machine, or on another one, which is a
+            network namespace.
+        flood: how many requests another process keeps out meanwhile, to the same service.
         rounds: rounds at most, where turns are long.
         metric: what its ratios are of.
+        measure: what of the ticks is measured; see `benchmarks.ticking.Ticked`.
     """
 
     key: str
@@ -46,9 +53,12 @@ class Scenario:
     callers: int = 1
     calls: int = 4000
     seconds: float = 5.0
-    action: Literal["call", "rest", "soak"] = "call"
+    action: Literal["call", "rest", "soak", "tick"] = "call"
+    host: Literal["same", "other"] = "same"
+    flood: int = 0
     rounds: int = 1000
     metric: str = "median"
+    measure: str = ""
 
     def to_json(self) -> dict[str, Any]:
         return {**dataclasses.asdict(self), "work": self.work.to_json()}
@@ -66,10 +76,11 @@ class Runner:
         self._results = results
         self._progress = progress
         self._turns = 0
-        self._server: Child | None = None
-        self._workers: dict[str, Child] = {}
+        self._children: dict[tuple[str, str], Child] = {}
+        self._hosts: Hosts | None = None
         self._hung: Counter[tuple[str, str]] = Counter()
         self._server_cores, self._worker_cores = split_cores() if pin else (None, None)
+        self._stack = ExitStack()
 
     def __enter__(self) -> Runner:
         return self
@@ -80,13 +91,15 @@ class Runner:
         exc: BaseException | None,
         tb: TracebackType | None,
     ) -> None:
-        for child in [*self._workers.values(), *([self._server] if self._server else [])]:
-            child.close() if exc_type is None else child.kill()
+        with self._stack:
+            for child in self._children.values():
+                child.close() if exc_type is None else child.kill()
 
     def run(self, scenarios: Sequence[Scenario]) -> None:
-        """Runs every scenario, one group after the other."""
+        """Runs every scenario that can be run here, one group after the other."""
         for scenario in scenarios:
             self._results.scenarios[scenario.key] = scenario.to_json()
+        scenarios = [scenario for scenario in scenarios if self._can_run(scenario)]
         groups = dict.fromkeys(scenario.group for scenario in scenarios)
         plans = {
             name: [(s, c) for s in scenarios if s.group == name for c in s.contestants]
@@ -103,6 +116,16 @@ class Runner:
                         self._turn(scenario, contestant, number)
                         self._progress.advance(task)
 
+    def _can_run(self, scenario: Scenario) -> bool:
+        if scenario.host == "other" and self._hosts is None:
+            try:
+                self._hosts = self._stack.enter_context(Hosts())
+            except NoHosts as exc:
+                self._results.skipped[scenario.key] = str(exc)
+                self._progress.console.print(f"{scenario.key}: skipped, {exc}", highlight=False)
+                return False
+        return True
+
     def _turn(self, scenario: Scenario, contestant: str, number: int) -> None:
         if self._hung[scenario.key, contestant] >= HANGS:
             return
@@ -112,12 +135,10 @@ class Runner:
         except Hung as exc:
             self._hung[scenario.key, contestant] += 1
             turn = dataclasses.replace(turn, outcome="hung", error=str(exc))
-            self._workers.pop(contestant).kill()
-            self._end_server()
+            self._end(scenario.host, contestant, kill=True)
         except ChildError as exc:
             turn = dataclasses.replace(turn, outcome="failed", error=str(exc))
-            self._workers.pop(contestant).close()
-            self._end_server()
+            self._end(scenario.host, contestant)
         else:
             turn = dataclasses.replace(turn, **measured)
         self._results.turns.append(turn)
@@ -127,16 +148,21 @@ class Runner:
         name = f"/bench/turn_{self._turns}"
         work = dataclasses.replace(scenario.work, srv_name=name).to_json()
         patience = PATIENCE + scenario.seconds
-        server, worker = self._serving(), self._worker(contestant, fresh=scenario.action != "call")
+        server, worker = self._server(scenario.host), self._worker(scenario, contestant)
         if scenario.work.server != "inside":
             server.ask("serve", work=work, timeout=READY_TIMEOUT)
         worker.ask("setup", work=work, timeout=READY_TIMEOUT + PATIENCE)
-        if scenario.action == "call":
+        if scenario.flood:
+            flood = self._child(scenario.host, "benchmarks.flood")
+            flood.ask("start", work=work, callers=scenario.flood, timeout=READY_TIMEOUT)
+        elif scenario.action == "call":
             warm_up = {"calls": max(10 * scenario.callers, scenario.calls // 10), "seconds": 1.0}
             worker.ask("call", callers=scenario.callers, timeout=patience, **warm_up)
         before = Usage(**server.ask("usage", timeout=PATIENCE))
         measured = self._act(scenario, worker, patience)
         after = Usage(**server.ask("usage", timeout=PATIENCE))
+        if scenario.flood:
+            flood.ask("stop", timeout=PATIENCE)
         worker.ask("close", timeout=PATIENCE)
         if scenario.work.server != "inside":
             server.ask("end", timeout=PATIENCE)
@@ -149,29 +175,47 @@ class Runner:
             answer["memory"] = tuple(answer["memory"])
         elif scenario.action == "rest":
             answer = worker.ask("rest", seconds=scenario.seconds, timeout=patience)
+        elif scenario.action == "tick":
+            wanted = {"calls": scenario.calls, "seconds": scenario.seconds}
+            tree = {"measure": scenario.measure, "leaves": scenario.callers}
+            answer = worker.ask("tick", timeout=patience, **tree, **wanted)
         else:
             wanted = {"calls": scenario.calls, "seconds": scenario.seconds}
             answer = worker.ask("call", callers=scenario.callers, timeout=patience, **wanted)
         return {**answer, "client": Usage(**answer["client"])}
 
-    def _serving(self) -> Child:
-        if self._server is None:
-            self._server = Child("benchmarks.server", cores=self._server_cores)
-        return self._server
+    def _server(self, host: str) -> Child:
+        return self._child(host, "benchmarks.server")
 
-    def _worker(self, contestant: str, *, fresh: bool) -> Child:
-        if fresh and contestant in self._workers:
-            self._workers.pop(contestant).close()
-        if contestant not in self._workers:
-            self._workers[contestant] = Child(
-                "benchmarks.worker", contestant, cores=self._worker_cores
+    def _worker(self, scenario: Scenario, contestant: str) -> Child:
+        used = self._children.get((scenario.host, contestant))
+        if used and scenario.action != "call":
+            del self._children[scenario.host, contestant]
+            used.close()
+        return self._child(scenario.host, "benchmarks.worker", contestant)
+
+    def _child(self, host: str, module: str, *args: str) -> Child:
+        key = (host, args[0] if args else module)
+        if key not in self._children:
+            on_server = module == "benchmarks.server"
+            prefix: Sequence[str] = ()
+            environment: Mapping[str, str] = {}
+            if host == "other":
+                assert self._hosts is not None
+                prefix = self._hosts.on_server if on_server else self._hosts.on_client
+                environment = self._hosts.environment
+            cores = self._server_cores if on_server else self._worker_cores
+            self._children[key] = Child(
+                module, *args, cores=cores, prefix=prefix, environment=environment
             )
-        return self._workers[contestant]
+        return self._children[key]
 
-    def _end_server(self) -> None:
-        if self._server:
-            self._server.close()
-            self._server = None
+    def _end(self, host: str, contestant: str, *, kill: bool = False) -> None:
+        """Ends the processes of a turn that went wrong."""
+        for name in (contestant, "benchmarks.server", "benchmarks.flood"):
+            child = self._children.pop((host, name), None)
+            if child is not None:
+                child.kill() if kill and name == contestant else child.close()
 
 
 def split_cores() -> tuple[set[int] | None, set[int] | None]:

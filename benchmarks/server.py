@@ -6,6 +6,7 @@ do.
 
 from __future__ import annotations
 
+import ctypes
 import heapq
 import os
 import select
@@ -21,9 +22,9 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 
 from benchmarks.contestants.base import spinning
-from benchmarks.loop_server import signal_requests
 from benchmarks.meter import usage
 from benchmarks.pipes import answer_lines
+from benchmarks.servers import SERVERS, async_handler, rosasync_server
 from benchmarks.work import Work, load_type, make_handler, make_qos, make_response
 
 LEAN_DEPTH = 1000
@@ -154,6 +155,15 @@ class EventServer(Lean):
         return fd
 
 
+def signal_requests(service: Any, fd: int | None) -> None:
+    """Has the middleware count a service's new requests on an eventfd; None ends that."""
+    on_request = ctypes.CDLL("librcl.so").rcl_service_set_on_new_request_callback
+    on_request.argtypes = [ctypes.c_void_p] * 3
+    callback = ctypes.cast(ctypes.CDLL(None).eventfd_write, ctypes.c_void_p)
+    if on_request(service.pointer, None if fd is None else callback, fd):
+        raise RuntimeError("the middleware takes no request callback")
+
+
 class Server:
     """What the runner may ask for: ``serve``, ``usage``, ``end``."""
 
@@ -176,6 +186,9 @@ class Server:
         return {}
 
     def _serve(self, work: Work) -> None:
+        if work.server in SERVERS:
+            self._stack.enter_context(rosasync_server(work))
+            return
         rclpy.init()
         node = rclpy.create_node("bench_server")
         if work.server == "lean":
@@ -185,7 +198,8 @@ class Server:
             return
         if any(work.delays):
             raise ValueError("the stock server answers at once: a delay would block its executor")
-        srv_type, qos, handler = load_type(work.srv_type), make_qos(work.depth), make_handler(work)
+        srv_type, qos = load_type(work.srv_type), make_qos(work.depth)
+        handler = (async_handler if work.server == "stock-async" else make_handler)(work)
         for name in work.names:
             node.create_service(srv_type, name, handler, qos_profile=qos)
         self._stack.enter_context(spinning(node, SingleThreadedExecutor()))

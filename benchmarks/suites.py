@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import defaultdict
 from collections.abc import Callable, Collection
 from functools import partial
 
 from benchmarks.contestants import CONTESTANTS
 from benchmarks.runner import Scenario
+from benchmarks.servers import SERVERS
+from benchmarks.targets import PEERS, TARGETS
+from benchmarks.ticks import make_ticks
 from benchmarks.work import Work
 
 __all__ = ["SUITES", "make_suite"]
 
-ALL = tuple(CONTESTANTS)
+ALL = tuple(
+    key for key, entry in CONTESTANTS.items() if key != "direct-retry" and entry.kind != "leaf"
+)
 MANY_AT_ONCE = tuple(key for key in ALL if key != "process-per-call")
 LEADING = ("direct", "direct-uvloop", "executor", "call", "afor-qos", "floor")
+POLLING = (*LEADING, "direct-busy", "busy")
 BRIDGES = ("direct", "executor")
 
 LEAN = Work(server="lean")
@@ -42,7 +49,6 @@ def _throughput() -> list[Scenario]:
         dataclasses.replace(
             _callers(n),
             key=f"{n} callers, depth 1000",
-            group=f"{n} callers",
             work=dataclasses.replace(LEAN, depth=1000),
         )
         for n in (64, 512)
@@ -75,7 +81,7 @@ def _callers(callers: int) -> Scenario:
     key = "1 caller, lean server" if callers == 1 else f"{callers} callers"
     return Scenario(
         key,
-        f"{callers} callers",
+        "callers",
         ALL if callers == 1 else MANY_AT_ONCE,
         LEAN,
         callers=callers,
@@ -112,17 +118,85 @@ def _payload(name: str, size: int) -> Scenario:
 
 def _delay(milliseconds: int) -> Scenario:
     work = dataclasses.replace(LEAN, delays=(milliseconds / 1000,))
-    return Scenario(f"answer after {milliseconds} ms", "delay", LEADING, work, calls=500)
+    return Scenario(f"answer after {milliseconds} ms", "delay", POLLING, work, calls=500)
+
+
+def _hosts() -> list[Scenario]:
+    one = Scenario("another host", "another host", POLLING, LEAN, host="other")
+    eight = dataclasses.replace(
+        one, key="another host, 8 callers", contestants=LEADING, callers=8, metric="rate"
+    )
+    return [one, eight]
+
+
+def _flood() -> list[Scenario]:
+    beside = Scenario(
+        "flood",
+        "flood",
+        ("direct-retry", "direct", "executor", "spin-until"),
+        Work(busy=0.05),
+        callers=10,
+        calls=400,
+        flood=8,
+        metric="lost",
+    )
+    deep = dataclasses.replace(
+        beside,
+        key="flood, depth 1000",
+        contestants=("spin-until",),
+        work=dataclasses.replace(beside.work, depth=1000),
+    )
+    return [beside, deep]
+
+
+def _servers() -> list[Scenario]:
+    one = [
+        Scenario(f"{name}, one", "servers, one at a time", ("floor",), Work(server=name))
+        for name in ("stock", "stock-async", *SERVERS)
+    ]
+    eight = [
+        dataclasses.replace(
+            scenario,
+            key=f"{scenario.work.server}, eight",
+            group="servers, eight at once",
+            contestants=("direct-uvloop",),
+            callers=8,
+            calls=16_000,
+            metric="rate",
+        )
+        for scenario in one
+    ]
+    return [*one, *eight]
 
 
 def _resting(clients: int) -> Work:
     return Work(idle_clients=clients)
 
 
+def _targets() -> list[Scenario]:
+    """The least that has to be measured to see whether the targets are reached."""
+    needed: defaultdict[str, set[str]] = defaultdict(set)
+    for scenario, contestant in (side for target in TARGETS for side in target.sides):
+        needed[scenario].update(PEERS.get(contestant, (contestant,)))
+    every = {s.key: s for name, make in SUITES.items() if name != "targets" for s in make()}
+    return [
+        dataclasses.replace(
+            scenario, contestants=tuple(c for c in scenario.contestants if c in needed[key])
+        )
+        for key, scenario in every.items()
+        if needed[key]
+    ]
+
+
 SUITES: dict[str, Callable[[], list[Scenario]]] = {
     "latency": _latency,
     "throughput": _throughput,
     "scale": _scale,
+    "hosts": _hosts,
+    "flood": _flood,
+    "ticks": make_ticks,
+    "targets": _targets,
+    "servers": _servers,
     "idle": partial(_idle, *BRIDGES),
     "memory": partial(_memory, *BRIDGES),
 }
@@ -151,8 +225,10 @@ def _narrow(scenario: Scenario, contestants: Collection[str]) -> Scenario:
 
 
 def _shorten(scenario: Scenario) -> Scenario:
+    if scenario.action == "tick":
+        return dataclasses.replace(scenario, calls=max(50, scenario.calls // 4))
     seconds = 3.0 if scenario.action == "rest" else 1.0
-    calls = max(2500, scenario.calls // 4, scenario.callers * 4)
+    calls = max(2500, scenario.calls // 2, scenario.callers * 4)
     return dataclasses.replace(
         scenario, seconds=seconds, calls=calls, rounds=1 if scenario.action == "soak" else 1000
     )

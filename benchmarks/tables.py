@@ -11,13 +11,17 @@ from rich.table import Table
 
 from benchmarks.figures import METRICS, brief, figure, pooled_percentile, ratio
 from benchmarks.results import Results, Turn
+from benchmarks.servers import SERVERS
 from benchmarks.targets import judge
+from benchmarks.ticks import describe_ticks
 
 __all__ = ["describe", "rows", "scenario_table", "target_table"]
 
 COLUMNS = {
     "median": ("median", "p99", "p99.9", "rate", "client_cpu", "server_cpu", "switches"),
     "rate": ("rate", "median", "p99", "p99.9", "client_cpu", "server_cpu", "switches"),
+    "lost": ("lost", "rate", "median", "p99"),
+    "threads": ("threads", "descriptors"),
     "share": ("share",),
     "growth": ("growth",),
 }
@@ -28,14 +32,26 @@ BASELINES = {"call": "÷ call", "floor": "÷ floor"}
 def describe(scenario: dict[str, Any]) -> str:
     """What a scenario is, in one line."""
     work = scenario["work"]
+    if scenario["action"] == "tick":
+        return describe_ticks(scenario["measure"], scenario["callers"])
     if scenario["action"] == "rest":
         return (
             f"{work['idle_clients'] or 'one'} client(s), nothing called, {scenario['seconds']:g} s"
         )
     if scenario["action"] == "soak":
         return "a third of the calls each answered, timed out and cancelled"
-    server = {"inside": "in the same process", "stock": "stock rclpy", "lean": "bare loop"}
-    parts = [f"server: {server[work['server']]}", f"callers: {scenario['callers']}"]
+    place = ", on another host" if scenario["host"] == "other" else ""
+    server = {
+        "inside": "in the same process",
+        "stock": "stock rclpy",
+        "stock-async": "stock rclpy, async handler",
+        "lean": "bare loop",
+        **{name: f"rosasync, {kind}" for name, kind in SERVERS.items()},
+    }
+    parts = [f"server: {server[work['server']]}{place}", f"callers: {scenario['callers']}"]
+    if scenario["flood"]:
+        parts.append(f"another process keeps {scenario['flood']} requests out")
+    parts += [f"the caller is busy for {work['busy'] * 1e3:g} ms at a time"] * (work["busy"] > 0)
     parts += [f"services: {work['services']}"] * (work["services"] > 1)
     parts += [f"idle clients: {work['idle_clients']}"] * (work["idle_clients"] > 0)
     parts += [f"payload: {work['payload']} bytes"] * (work["payload"] > 0)

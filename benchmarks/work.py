@@ -7,7 +7,7 @@ import dataclasses
 import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 __all__ = [
     "CALL_TIMEOUT",
@@ -39,7 +39,9 @@ class Work:
         idle_clients: clients that are there and never used.
         depth: history depth of clients and servers; None for what each has by default.
         server: ``stock``, an rclpy service on a SingleThreadedExecutor; ``lean``, a bare loop that
-            is not the bottleneck; ``inside``, in the contestant's own process, made by itself.
+            is not the bottleneck; ``inside``, in the contestant's own process, made by itself;
+            ``stock-async``, stock with an async handler; and those of `benchmarks.servers`.
+        busy: seconds at a time for which the contestant's thread looks at no responses.
         srv_name: what all services of this work begin with; the runner gives each turn its own.
     """
 
@@ -49,7 +51,8 @@ class Work:
     services: int = 1
     idle_clients: int = 0
     depth: int | None = None
-    server: Literal["stock", "lean", "inside"] = "stock"
+    server: str = "stock"
+    busy: float = 0.0
     srv_name: str = "/bench"
 
     @classmethod

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, cast
 
 from benchmarks.contestants import Contestant, Tally, make_contestant
 from benchmarks.contestants.base import Soaking
 from benchmarks.meter import Usage, resident_bytes, usage
 from benchmarks.pipes import answer_lines
+from benchmarks.ticking import Ticking
 from benchmarks.work import Work
 
+MARGIN = 0.5
+"""Seconds for which a rest is not yet, and no longer, looked at."""
 SOAK_STATES = (10_000, 100_000)
 """The calls after which the memory is looked at."""
 
@@ -36,11 +41,11 @@ class Worker:
         return _result(tally, usage() - before)
 
     def do_rest(self, seconds: float) -> dict[str, Any]:
-        before = usage()
-        tally = Tally()
-        with tally.timed():
-            self._contestant.rest(seconds)
-        return _result(tally, usage() - before)
+        """The beginning and the end of the rest are left out, which are not rest."""
+        with ThreadPoolExecutor(1) as thread:
+            used = thread.submit(_usage_within, seconds)
+            self._contestant.rest(seconds + 2 * MARGIN)
+            return _result(Tally(elapsed=round(seconds * 1e9)), used.result())
 
     def do_soak(self) -> dict[str, Any]:
         before, done = usage(), 0
@@ -51,9 +56,21 @@ class Worker:
             memory.append(resident_bytes())
         return {**_result(tally, usage() - before), "memory": memory}
 
+    def do_tick(self, measure: str, leaves: int, calls: int, seconds: float) -> dict[str, Any]:
+        before = usage()
+        tally = cast(Ticking, self._contestant).tick(measure, leaves, calls, seconds)
+        return {**_result(tally, usage() - before), "added": tally.added}
+
     def do_close(self) -> dict[str, Any]:
         self._contestant.close()
         return {}
+
+
+def _usage_within(seconds: float) -> Usage:
+    time.sleep(MARGIN)
+    before = usage()
+    time.sleep(seconds)
+    return usage() - before
 
 
 def _result(tally: Tally, used: Usage) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 from dataclasses import dataclass
+from typing import Literal
 
 from benchmarks.contestants.base import Contestant, Tally
 
@@ -16,16 +17,27 @@ class Entry:
 
     label: str
     module: str
+    kind: Literal["ours", "peer", "limit", "leaf"] = "peer"
+    """A limit is what a call costs at least, no way to write a program; a leaf calls in ticks."""
     spins: bool = False
     """Whether it burns a core while it waits."""
 
 
 CONTESTANTS = {
-    "direct": Entry("rosasync, direct bridge", "rosasync_session"),
-    "direct-uvloop": Entry("rosasync, direct bridge, uvloop", "rosasync_session"),
-    "direct-exclusive": Entry("rosasync, direct bridge, 8 exclusive clients", "rosasync_session"),
-    "executor": Entry("rosasync, executor bridge", "rosasync_session"),
-    "executor-uvloop": Entry("rosasync, executor bridge, uvloop", "rosasync_session"),
+    "direct": Entry("rosasync, direct bridge", "rosasync_session", "ours"),
+    "direct-uvloop": Entry("rosasync, direct bridge, uvloop", "rosasync_session", "ours"),
+    "direct-exclusive": Entry(
+        "rosasync, direct bridge, 8 exclusive clients", "rosasync_session", "ours"
+    ),
+    "direct-retry": Entry("rosasync, direct bridge, with Retry", "rosasync_session", "ours"),
+    "direct-busy": Entry(
+        "rosasync, direct bridge, busy poll", "rosasync_session", "ours", spins=True
+    ),
+    "direct-busy-uvloop": Entry(
+        "rosasync, direct bridge, busy poll, uvloop", "rosasync_session", "ours", spins=True
+    ),
+    "executor": Entry("rosasync, executor bridge", "rosasync_session", "ours"),
+    "executor-uvloop": Entry("rosasync, executor bridge, uvloop", "rosasync_session", "ours"),
     "call": Entry("client.call, SingleThreadedExecutor in a thread", "threaded_call"),
     "call-multi": Entry("client.call, MultiThreadedExecutor in a thread", "multithreaded_executor"),
     "pool": Entry("client.call in a thread pool", "thread_pool"),
@@ -37,8 +49,14 @@ CONTESTANTS = {
     "afor-qos": Entry("asyncio-for-robotics, the service QoS", "asyncio_for_robotics"),
     "thread-per-call": Entry("a thread for each call", "thread_per_call"),
     "process-per-call": Entry("a process for each call", "process_per_call"),
-    "floor": Entry("wait set in the calling thread (the floor)", "wait_set"),
-    "busy": Entry("busy poll of take_response (the limit)", "busy_poll", spins=True),
+    "floor": Entry("wait set in the calling thread (the floor)", "wait_set", "limit"),
+    "busy": Entry("busy poll of take_response (the limit)", "busy_poll", "limit", spins=True),
+    "tick-running": Entry("py_trees' own Running, no call", "ticked_rosasync", "leaf"),
+    "tick-py-trees": Entry("CallService of py_trees", "ticked_rosasync", "leaf"),
+    "tick-loop": Entry("AsyncServiceProxy, ticked in the loop", "ticked_rosasync", "leaf"),
+    "tick-thread": Entry("AsyncServiceProxy, ticked in a thread", "ticked_rosasync", "leaf"),
+    "tick-threads": Entry("a thread for each call, claimed clients", "ticked_threads", "leaf"),
+    "tick-processes": Entry("a process for each call, a manager", "ticked_processes", "leaf"),
 }
 
 

@@ -16,6 +16,7 @@ from benchmarks.pipes import describe
 from benchmarks.work import READY_TIMEOUT, Work, load_type, make_handler, make_qos
 
 __all__ = [
+    "BREATH",
     "Asynchronous",
     "Blocking",
     "Contestant",
@@ -28,6 +29,9 @@ __all__ = [
 ]
 
 now = time.perf_counter_ns
+
+BREATH = 0.005
+"""Seconds a contestant that is busy has for its calls in between."""
 
 
 @dataclass
@@ -172,6 +176,7 @@ class Asynchronous(ABC):
     """A contestant whose callers are asyncio tasks."""
 
     services = 1
+    busy = 0.0
     loop_factory: Callable[[], asyncio.AbstractEventLoop] | None = None
 
     @abstractmethod
@@ -185,7 +190,7 @@ class Asynchronous(ABC):
     async def shut(self) -> None: ...
 
     def setup(self, work: Work) -> None:
-        self.services = work.services
+        self.services, self.busy = work.services, work.busy
         self.runner = asyncio.Runner(loop_factory=self.loop_factory)
         self.runner.run(self.open(work))
 
@@ -206,10 +211,18 @@ class Asynchronous(ABC):
         tally = Tally()
         until = _until(seconds)
         with tally.timed():
+            other = asyncio.create_task(self._other_work())
             async with asyncio.TaskGroup() as group:
                 for i in range(callers):
                     group.create_task(self._caller(range(i, calls, callers), until, tally))
+            other.cancel()
         return tally
+
+    async def _other_work(self) -> None:
+        """Holds the loop up, where it is to be busy with something else."""
+        while self.busy:
+            time.sleep(self.busy)  # noqa: ASYNC251
+            await asyncio.sleep(BREATH)
 
     async def _caller(self, calls: range, until: int, tally: Tally) -> None:
         for i in calls:

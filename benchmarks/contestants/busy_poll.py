@@ -12,7 +12,7 @@ class BusyPoll(WaitSet):
         for service in {service for service, _ in out}:
             self.take(service, self._clients[service], out, tally)
         if len(out) == before:
-            give_up(out, tally)
+            give_up(out, tally, self.patience)
 
 
 CONTESTANTS = {"busy": BusyPoll}

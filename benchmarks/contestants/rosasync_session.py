@@ -12,12 +12,12 @@ import uvloop
 
 import rosasync
 from benchmarks.contestants.base import Asynchronous, Tally
-from benchmarks.loop_server import LoopServer
 from benchmarks.work import (
     CALL_TIMEOUT,
     READY_TIMEOUT,
     Work,
     load_type,
+    make_handler,
     make_qos,
     make_request,
 )
@@ -32,10 +32,14 @@ class Rosasync(Asynchronous):
         bridge: Literal["direct", "executor"],
         loop_factory: Callable[[], asyncio.AbstractEventLoop] | None = None,
         limits: rosasync.Limits | None = None,
+        busy_poll: float = 0.0,
+        retry: rosasync.Retry | None = None,
     ) -> None:
         self._bridge = bridge
         self.loop_factory = loop_factory
         self._limits = limits or rosasync.Limits()
+        self._busy_poll = busy_poll
+        self._retry = retry
 
     async def open(self, work: Work) -> None:
         srv_type = load_type(work.srv_type)
@@ -43,13 +47,16 @@ class Rosasync(Asynchronous):
         self._stack = AsyncExitStack()
         session: Any = await self._stack.enter_async_context(
             rosasync.Session(
-                "bench", bridge=self._bridge, limits=self._limits, timeout=CALL_TIMEOUT
+                "bench",
+                bridge=self._bridge,
+                limits=self._limits,
+                timeout=CALL_TIMEOUT,
+                busy_poll=self._busy_poll,
             )
         )
         if work.server == "inside":
             for name in work.names:
-                server = LoopServer(session.node, work, name)
-                self._stack.callback(server.close)
+                session.serve(srv_type, name, make_handler(work), qos=qos)
         self._clients = [session.client(srv_type, name, qos=qos) for name in work.names]
         for client in self._clients:
             await client.wait(READY_TIMEOUT)
@@ -57,7 +64,7 @@ class Rosasync(Asynchronous):
         self._request = make_request(work)
 
     async def call(self, service: int) -> None:
-        await self._clients[service].call(self._request)
+        await self._clients[service].call(self._request, retry=self._retry)
 
     async def shut(self) -> None:
         await self._stack.aclose()
@@ -98,12 +105,17 @@ class Rosasync(Asynchronous):
                 cancelled = task.cancelled()
 
 
+BUSY_POLL = 0.001
 _exclusive = rosasync.Limits(clients=8, in_flight=1)
+_retry = rosasync.Retry(attempts=10, after=0.2, backoff=1.0)
 
 CONTESTANTS = {
     "direct": partial(Rosasync, "direct"),
     "direct-uvloop": partial(Rosasync, "direct", uvloop.new_event_loop),
     "direct-exclusive": partial(Rosasync, "direct", None, _exclusive),
+    "direct-retry": partial(Rosasync, "direct", retry=_retry),
+    "direct-busy": partial(Rosasync, "direct", busy_poll=BUSY_POLL),
+    "direct-busy-uvloop": partial(Rosasync, "direct", uvloop.new_event_loop, busy_poll=BUSY_POLL),
     "executor": partial(Rosasync, "executor"),
     "executor-uvloop": partial(Rosasync, "executor", uvloop.new_event_loop),
 }

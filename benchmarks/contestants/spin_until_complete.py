@@ -12,14 +12,14 @@ from benchmarks.work import CALL_TIMEOUT, Work, make_request
 
 class SpinUntilComplete(Blocking):
     def setup(self, work: Work) -> None:
-        self.services = work.services
+        self.services, self._busy = work.services, work.busy
         rclpy.init()
         self._node = rclpy.create_node("bench")
         self._clients = make_clients(self._node, work)
         self._request = make_request(work)
 
     def call(self, service: int) -> None:
-        self._complete(self._clients[service].call_async(self._request))
+        self._complete(self._clients[service].call_async(self._request), CALL_TIMEOUT)
 
     def at_once(self, callers: int, calls: int, seconds: float) -> Tally:
         """One thread may spin the node: so the calls go out in batches, one for each caller."""
@@ -33,9 +33,10 @@ class SpinUntilComplete(Blocking):
                     (now(), self._clients[i % self.services].call_async(self._request))
                     for i in range(first, min(first + callers, calls))
                 ]
+                time.sleep(self._busy)
                 for begin, future in batch:
                     try:
-                        self._complete(future)
+                        self._complete(future, CALL_TIMEOUT - (now() - begin) / 1e9)
                     except Exception as exc:
                         tally.miss(exc)
                     else:
@@ -51,8 +52,8 @@ class SpinUntilComplete(Blocking):
         self._node.destroy_node()
         rclpy.shutdown()
 
-    def _complete(self, future: rclpy.task.Future) -> None:
-        rclpy.spin_until_future_complete(self._node, future, timeout_sec=CALL_TIMEOUT)
+    def _complete(self, future: rclpy.task.Future, seconds: float) -> None:
+        rclpy.spin_until_future_complete(self._node, future, timeout_sec=max(seconds, 0.0))
         if not future.done():
             raise TimeoutError("no response")
         future.result()

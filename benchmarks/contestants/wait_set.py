@@ -11,10 +11,11 @@ from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from benchmarks.contestants.base import Tally, make_clients, now
 from benchmarks.work import CALL_TIMEOUT, Work, load_type, make_request
 
-TIMEOUT = round(CALL_TIMEOUT * 1e9)
-
 
 class WaitSet:
+    patience = CALL_TIMEOUT
+    """Seconds after which a call counts as lost."""
+
     def setup(self, work: Work) -> None:
         rclpy.init()
         self._node = rclpy.create_node("bench")
@@ -48,10 +49,10 @@ class WaitSet:
         self._wait_set.clear_entities()
         for client in self._clients:
             self._wait_set.add_client(client)
-        self._wait_set.wait(TIMEOUT)
+        self._wait_set.wait(round(self.patience * 1e9))
         ready = self._wait_set.get_ready_entities("client")
         if not ready:
-            give_up(out, tally)
+            give_up(out, tally, self.patience)
         for service, client in enumerate(self._clients):
             if client.pointer in ready:
                 self.take(service, client, out, tally)
@@ -73,9 +74,9 @@ class WaitSet:
         rclpy.shutdown()
 
 
-def give_up(out: dict[tuple[int, int], int], tally: Tally) -> None:
+def give_up(out: dict[tuple[int, int], int], tally: Tally, patience: float) -> None:
     """Counts every call as lost that has been out for too long; the first is the oldest."""
-    limit = now() - TIMEOUT
+    limit = now() - round(patience * 1e9)
     while out and out[oldest := next(iter(out))] < limit:
         del out[oldest]
         tally.lost += 1

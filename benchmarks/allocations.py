@@ -1,0 +1,332 @@
+"""What a call and a request cost in memory: ``python -m benchmarks allocations``.
+
+The study of rclcpp services asks where a service call allocates. In Python everything does; so the
+questions are how much a call holds while it is out, how much a call or request needs at its peak,
+and whether any of it stays. As a program (``python -m benchmarks.allocations KIND``) this is the
+process that is looked at.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import sys
+import time
+import tracemalloc
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from contextlib import AsyncExitStack, ExitStack, contextmanager
+from functools import partial
+from typing import Any, Literal
+
+from rich.box import SIMPLE
+from rich.progress import Progress
+from rich.table import Table
+
+import rosasync
+from benchmarks.contestants.base import spinning
+from benchmarks.meter import resident_bytes
+from benchmarks.pipes import Child, answer_lines
+from benchmarks.server import Server
+from benchmarks.work import READY_TIMEOUT, Work, load_type, make_request
+
+__all__ = ["measure_allocations", "show_allocations"]
+
+OUT = 200
+"""Calls that are out at once while what they hold is counted; they last ``SLOW`` seconds."""
+SLOW = 2.0
+PEAK_CALLS = 200
+WARM = 10_000
+CALLS, QUICK_CALLS = 100_000, 20_000
+PATIENCE = 300.0
+
+CLIENTS = {
+    "direct": "rosasync, direct bridge",
+    "executor": "rosasync, executor bridge",
+    "call": "client.call (call_async for calls at once)",
+}
+SERVED = {
+    "rosasync": "rosasync, async handler",
+    "rosasync-plain": "rosasync, plain handler",
+    "stock-async": "stock rclpy, async handler",
+    "stock": "stock rclpy, plain handler",
+}
+
+Row = dict[str, float]
+
+
+class Caller(ABC):
+    """Calls that are made in the process looked at."""
+
+    @abstractmethod
+    def call(self, calls: int) -> None:
+        """Makes so many calls, one at a time."""
+
+    @abstractmethod
+    def hold(self, calls: int, look: Callable[[], None]) -> None:
+        """Makes so many calls at once, looks while they are out, and awaits them."""
+
+    @abstractmethod
+    def pending(self) -> int:
+        """How many requests are kept an entry for."""
+
+
+class RosasyncCaller(Caller):
+    def __init__(self, bridge: Literal["direct", "executor"], work: Work, stack: ExitStack) -> None:
+        self._runner = stack.enter_context(asyncio.Runner())
+        self._exits = AsyncExitStack()
+        stack.callback(lambda: self._runner.run(self._exits.aclose()))
+        self._request = make_request(work)
+        self._runner.run(self._open(bridge, work))
+
+    async def _open(self, bridge: Literal["direct", "executor"], work: Work) -> None:
+        limits = rosasync.Limits(in_flight=OUT)
+        self._session = await self._exits.enter_async_context(
+            rosasync.Session("bench", bridge=bridge, limits=limits, timeout=READY_TIMEOUT)
+        )
+        srv_type = load_type(work.srv_type)
+        self._clients = [self._session.client(srv_type, name) for name in work.names]
+        for client in self._clients:
+            await client.wait(READY_TIMEOUT)
+
+    def call(self, calls: int) -> None:
+        self._runner.run(self._call(calls))
+
+    def hold(self, calls: int, look: Callable[[], None]) -> None:
+        self._runner.run(self._hold(calls, look))
+
+    def pending(self) -> int:
+        node = self._session.node
+        statistics = self._session.pool.statistics()
+        mine = statistics.in_flight + statistics.abandoned
+        return mine + sum(len(client._pending_requests) for client in node.clients)
+
+    async def _call(self, calls: int) -> None:
+        for _ in range(calls):
+            await self._clients[0].call(self._request)
+
+    async def _hold(self, calls: int, look: Callable[[], None]) -> None:
+        out = [self._clients[1].start(self._request) for _ in range(calls)]
+        await asyncio.sleep(0)
+        assert self._session.pool.statistics().in_flight == calls
+        look()
+        await asyncio.gather(*out)
+
+
+class StockCaller(Caller):
+    def __init__(self, work: Work, stack: ExitStack) -> None:
+        import rclpy
+        from rclpy.executors import SingleThreadedExecutor
+        from rclpy.qos import QoSProfile
+
+        rclpy.init()
+        node = rclpy.create_node("bench")
+        srv_type, qos = load_type(work.srv_type), QoSProfile(depth=1000)
+        self._clients = [node.create_client(srv_type, n, qos_profile=qos) for n in work.names]
+        stack.enter_context(spinning(node, SingleThreadedExecutor()))
+        for client in self._clients:
+            client.wait_for_service(timeout_sec=READY_TIMEOUT)
+        self._request = make_request(work)
+
+    def call(self, calls: int) -> None:
+        for _ in range(calls):
+            self._clients[0].call(self._request, timeout_sec=READY_TIMEOUT)
+
+    def hold(self, calls: int, look: Callable[[], None]) -> None:
+        out = [self._clients[1].call_async(self._request) for _ in range(calls)]
+        look()
+        while not all(future.done() for future in out):
+            time.sleep(SLOW / 10)
+
+    def pending(self) -> int:
+        return sum(len(client._pending_requests) for client in self._clients)
+
+
+CALLERS: dict[str, Callable[[Work, ExitStack], Caller]] = {
+    "direct": partial(RosasyncCaller, "direct"),
+    "executor": partial(RosasyncCaller, "executor"),
+    "call": StockCaller,
+}
+
+
+class Subject:
+    """The process looked at: a client, or a server that another process calls."""
+
+    def __init__(self, kind: str) -> None:
+        self._kind = kind
+        self._stack = ExitStack()
+        self._caller: Caller | None = None
+
+    def answer(self, message: dict[str, Any]) -> dict[str, Any]:
+        answer: dict[str, Any] = getattr(self, "do_" + message.pop("do"))(**message)
+        return answer
+
+    def do_setup(self, work: dict[str, Any]) -> dict[str, Any]:
+        if self._kind in CALLERS:
+            self._caller = CALLERS[self._kind](Work.from_json(work), self._stack)
+        else:
+            server = Server()
+            server.do_serve({**work, "server": self._kind})
+            self._stack.callback(server.do_end)
+        return {}
+
+    def do_call(self, calls: int) -> dict[str, Any]:
+        assert self._caller is not None
+        self._caller.call(calls)
+        return {}
+
+    def do_held(self, calls: int) -> dict[str, Any]:
+        assert self._caller is not None
+        found: dict[str, Any] = {}
+        with tracing():
+            self._caller.hold(calls, lambda: None)
+            before = traced()
+
+            def look() -> None:
+                blocks, size = traced()
+                found["blocks"] = (blocks - before[0]) / calls
+                found["bytes"] = (size - before[1]) / calls
+
+            self._caller.hold(calls, look)
+        return found
+
+    def do_peak_begin(self) -> dict[str, Any]:
+        tracemalloc.start()
+        return {}
+
+    def do_peak_rest(self) -> dict[str, Any]:
+        gc.collect()
+        gc.disable()
+        self._resting = tracemalloc.get_traced_memory()[0]
+        tracemalloc.reset_peak()
+        return {}
+
+    def do_peak_end(self) -> dict[str, Any]:
+        peak = tracemalloc.get_traced_memory()[1] - self._resting
+        tracemalloc.stop()
+        gc.enable()
+        return {"peak": peak}
+
+    def do_state(self) -> dict[str, Any]:
+        resident = resident_bytes()
+        return {
+            "resident": resident,
+            "blocks": sys.getallocatedblocks(),
+            "pending": self._caller.pending() if self._caller else 0,
+        }
+
+    def close(self) -> None:
+        self._stack.close()
+
+
+@contextmanager
+def tracing() -> Iterator[None]:
+    tracemalloc.start()
+    try:
+        yield
+    finally:
+        tracemalloc.stop()
+
+
+def traced() -> tuple[int, int]:
+    """Blocks and bytes that Python has allocated since the tracing began, and not freed."""
+    gc.collect()
+    traces = tracemalloc.take_snapshot().traces
+    return len(traces), sum(trace.size for trace in traces)
+
+
+def measure_allocations(*, quick: bool, progress: Progress) -> dict[str, dict[str, Row]]:
+    """Looks at every client and server; each in a process of its own."""
+    calls = QUICK_CALLS if quick else CALLS
+    task = progress.add_task("", total=len(CLIENTS) + len(SERVED))
+    found: dict[str, dict[str, Row]] = {"clients": {}, "servers": {}}
+    for part, kinds, measure in (
+        ("clients", CLIENTS, _measure_client),
+        ("servers", SERVED, _measure_server),
+    ):
+        for number, kind in enumerate(kinds):
+            progress.update(task, description=f"{part}: {kind}")
+            work = Work(server="lean", services=2, delays=(0.0, SLOW), srv_name=f"/{part}_{number}")
+            found[part][kind] = measure(kind, work, calls)
+            progress.advance(task)
+    return found
+
+
+def _measure_client(kind: str, work: Work, calls: int) -> Row:
+    with Child("benchmarks.server") as server, Child("benchmarks.allocations", kind) as client:
+        server.ask("serve", work=work.to_json(), timeout=READY_TIMEOUT)
+        client.ask("setup", work=work.to_json(), timeout=2 * READY_TIMEOUT)
+        call = partial(client.ask, "call", timeout=PATIENCE)
+        held = client.ask("held", calls=OUT, timeout=PATIENCE)
+        return {**held, **_look(client, call, calls)}
+
+
+def _measure_server(kind: str, work: Work, calls: int) -> Row:
+    work = Work(srv_name=work.srv_name)
+    with (
+        Child("benchmarks.allocations", kind) as server,
+        Child("benchmarks.worker", "floor") as one,
+    ):
+        server.ask("setup", work=work.to_json(), timeout=READY_TIMEOUT)
+        one.ask("setup", work=work.to_json(), timeout=2 * READY_TIMEOUT)
+        call = partial(one.ask, "call", callers=1, seconds=PATIENCE, timeout=2 * PATIENCE)
+        found = _look(server, call, calls)
+        one.ask("close", timeout=READY_TIMEOUT)
+        return found
+
+
+def _look(subject: Child, call: Callable[..., Any], calls: int) -> Row:
+    """The peak of a call, then what is left after many."""
+    ask = partial(subject.ask, timeout=PATIENCE)
+    call(calls=PEAK_CALLS)
+    ask("peak_begin")
+    call(calls=PEAK_CALLS)
+    ask("peak_rest")
+    call(calls=PEAK_CALLS)
+    found: Row = ask("peak_end")
+    call(calls=WARM)
+    before = ask("state")
+    call(calls=calls - WARM)
+    after = ask("state")
+    return {
+        **found,
+        "kept_blocks": after["blocks"] - before["blocks"],
+        "growth": (after["resident"] - before["resident"]) / 1e6,
+        "pending": after["pending"],
+    }
+
+
+COLUMNS: dict[str, tuple[str, str]] = {
+    "blocks": ("blocks held by a call that is out", "{:.1f}"),
+    "bytes": ("bytes held by it", "{:,.0f}"),
+    "peak": ("bytes at the peak", "{:,.0f}"),
+    "kept_blocks": ("blocks kept", "{:+,.0f}"),
+    "growth": ("growth, MB", "{:+.2f}"),
+    "pending": ("pending", "{:.0f}"),
+}
+
+
+def show_allocations(found: dict[str, dict[str, Row]]) -> Iterator[Table]:
+    """A table for the clients and one for the servers."""
+    for part, labels in (("clients", CLIENTS), ("servers", SERVED)):
+        rows = found[part]
+        keys = [key for key in COLUMNS if any(key in row for row in rows.values())]
+        if part == "servers":
+            keys.remove("pending")
+        table = Table(title=f"[bold]{part}[/]", title_justify="left", box=SIMPLE)
+        table.add_column("")
+        for key in keys:
+            table.add_column(COLUMNS[key][0], justify="right")
+        for kind, row in rows.items():
+            table.add_row(labels[kind], *(COLUMNS[key][1].format(row[key]) for key in keys))
+        yield table
+
+
+def main() -> None:
+    subject = Subject(sys.argv[1])
+    answer_lines(subject.answer)
+    subject.close()
+
+
+if __name__ == "__main__":
+    main()

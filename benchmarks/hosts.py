@@ -1,0 +1,79 @@
+"""Two hosts on one machine: network namespaces joined by a virtual cable, gone with the run."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from contextlib import ExitStack
+from types import TracebackType
+
+__all__ = ["Hosts", "NoHosts"]
+
+ENVIRONMENT = {
+    "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",
+    # The namespaces share one kernel's memory, which two machines would not.
+    "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
+}
+
+
+class NoHosts(Exception):
+    """This machine lets the run make no network namespaces; the text says why."""
+
+
+class Hosts:
+    """A host for the server and one for the contestants.
+
+    Raises:
+        NoHosts: on entering, where there is no iproute2, or no right to use it.
+    """
+
+    environment = ENVIRONMENT
+
+    def __init__(self) -> None:
+        self._names = [f"rosasync-{os.getpid()}-{side}" for side in ("server", "client")]
+        self._stack = ExitStack()
+
+    def __enter__(self) -> Hosts:
+        if shutil.which("ip") is None:
+            raise NoHosts("there is no `ip` (iproute2)")
+        if os.geteuid() != 0:
+            raise NoHosts("network namespaces need root")
+        with self._stack:
+            for name in self._names:
+                _ip("netns", "add", name)
+                self._stack.callback(_ip, "netns", "delete", name)
+            server, client = self._names
+            cable = ["type", "veth", "peer", "name", "eth0", "netns", client]
+            _ip("link", "add", "eth0", "netns", server, *cable)
+            for number, name in enumerate(self._names, 1):
+                _ip("-n", name, "address", "add", f"10.0.0.{number}/24", "dev", "eth0")
+                for link in ("lo", "eth0"):
+                    _ip("-n", name, "link", "set", link, "up")
+                _ip("-n", name, "route", "add", "224.0.0.0/4", "dev", "eth0")
+            self._stack = self._stack.pop_all()
+        return self
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        tb: TracebackType | None,
+    ) -> None:
+        self._stack.close()
+
+    @property
+    def on_server(self) -> list[str]:
+        """What a command begins with that is to run on the server's host."""
+        return ["ip", "netns", "exec", self._names[0]]
+
+    @property
+    def on_client(self) -> list[str]:
+        """The same for the contestants' host."""
+        return ["ip", "netns", "exec", self._names[1]]
+
+
+def _ip(*arguments: str) -> None:
+    done = subprocess.run(["ip", *arguments], capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise NoHosts(f"`ip {' '.join(arguments)}` failed: {done.stderr.strip()}")

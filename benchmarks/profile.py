@@ -1,0 +1,269 @@
+"""Where the time of one call goes, between ``await`` and its answer: stamps along its path."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import selectors
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import Context
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any, TypeVar, TypeVarTuple
+
+import numpy as np
+from rich.box import SIMPLE
+from rich.table import Table
+
+import rosasync
+from benchmarks.pipes import Child
+from benchmarks.work import CALL_TIMEOUT, READY_TIMEOUT, Work, load_type, make_request
+
+__all__ = ["STAGES", "Profile", "Stage", "profile", "table", "updated"]
+
+T = TypeVar("T")
+Args = TypeVarTuple("Args")
+
+BEGIN, END = "<!-- profile -->", "<!-- /profile -->"
+
+PATIENCE = 10.0
+WARM_UP = 500
+ROUND = 250
+"""Calls after which stamped and unstamped ones alternate, so that both meet the same machine."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What happens between two stamps, and whose time it is."""
+
+    whose: str
+    what: str
+
+
+OURS, ASYNCIO, MIDDLEWARE, KERNEL, ASLEEP = "rosasync", "asyncio", "middleware", "kernel", "asleep"
+
+STAGES = {
+    ("await", "send"): Stage(OURS, "checks, deadline, lease, future"),
+    ("send", "sent"): Stage(MIDDLEWARE, "`send_request`: converts and writes the request"),
+    ("sent", "timer"): Stage(OURS, "registers the sequence number"),
+    ("timer", "armed"): Stage(ASYNCIO, "the deadline's timer"),
+    ("armed", "select"): Stage(ASYNCIO, "the task suspends, the loop looks for what is due"),
+    ("sent", "select"): Stage(
+        ASYNCIO, "the number is registered, the task suspends, the loop looks for what is due"
+    ),
+    ("select", "selected"): Stage(ASLEEP, "to the server, its work, and back; the wake-up"),
+    ("selected", "read"): Stage(ASYNCIO, "the loop calls the reader"),
+    ("read", "counted"): Stage(KERNEL, "reads the eventfd"),
+    ("counted", "take"): Stage(OURS, "finds the client that waits"),
+    ("take", "taken"): Stage(MIDDLEWARE, "`take_response`: takes and converts the response"),
+    ("taken", "deliver"): Stage(OURS, "finds the future of the sequence number"),
+    ("deliver", "delivered"): Stage(OURS, "completes the future"),
+    ("delivered", "again"): Stage(ASYNCIO, "the reader returns, the loop goes round"),
+    ("again", "polled"): Stage(KERNEL, "the loop looks for other events"),
+    ("polled", "resumed"): Stage(ASYNCIO, "wakes the task up"),
+    ("resumed", "released"): Stage(OURS, "returns the lease"),
+    ("released", "answer"): Stage(OURS, "counts, returns"),
+}
+"""By the names of the stamps at both ends, in order."""
+
+
+@dataclass
+class Profile:
+    """Medians in µs.
+
+    Attributes:
+        stages: each stage's, in order.
+        stamped: of whole calls with the stamps, and `plain` of those without.
+        calls: that took the path of most calls, and `off_path` those left out, which did not.
+    """
+
+    stages: dict[Stage, float]
+    stamped: float
+    plain: float
+    calls: int
+    off_path: int
+
+    def shares(self) -> dict[str, float]:
+        """The time of each party together."""
+        shares: defaultdict[str, float] = defaultdict(float)
+        for stage, median in self.stages.items():
+            shares[stage.whose] += median
+        return dict(shares)
+
+    @property
+    def summary(self) -> str:
+        """What the stages come to, in a sentence or two."""
+        shares = ", ".join(f"{whose} {us:.1f} µs" for whose, us in self.shares().items())
+        return (
+            f"Together: {shares}. A whole call took {self.plain:.1f} µs, and {self.stamped:.1f} "
+            f"with the stamps; medians of {self.calls:,} calls."
+        )
+
+
+def table(found: Profile) -> Table:
+    """The stages, for the terminal."""
+    table = Table(caption=found.summary, caption_justify="left", box=SIMPLE)
+    for column in ("", "whose", "µs"):
+        table.add_column(column, justify="right" if column == "µs" else "left")
+    for stage, median in found.stages.items():
+        table.add_row(stage.what.replace("`", ""), stage.whose, f"{median:.1f}")
+    return table
+
+
+def updated(page: str, found: Profile, machine: dict[str, Any]) -> str:
+    """A Markdown page, with the stages between its marks.
+
+    Raises:
+        ValueError: the page does not have the marks.
+    """
+    before, begin, rest = page.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not end:
+        raise ValueError(f"the page has no {BEGIN} … {END}")
+    rows = "\n".join(f"| {s.what} | {s.whose} | {us:.1f} |" for s, us in found.stages.items())
+    where = f"{machine['cpu']}, {machine['cores']} cores, Python {machine['python']}"
+    return (
+        f"{before}{begin}\n| what happens | whose time | µs |\n|---|---|---:|\n{rows}\n\n"
+        f"{found.summary} {where}.\n{end}{after}"
+    )
+
+
+class Stamps:
+    """The names and times of one call after the other, in ns; costs what it measures a little."""
+
+    def __init__(self) -> None:
+        self.on = False
+        self.taken: list[tuple[str, int]] = []
+
+    def add(self, name: str) -> None:
+        if self.on:
+            self.taken.append((name, time.perf_counter_ns()))
+
+    def around(self, function: Callable[..., T], before: str, after: str) -> Callable[..., T]:
+        """The function, stamped before and after."""
+
+        def stamped(*args: Any) -> T:
+            self.add(before)
+            result = function(*args)
+            self.add(after)
+            return result
+
+        return stamped
+
+
+class StampedSelector(selectors.EpollSelector):
+    """Tells a sleep from a look: after a response is delivered, the loop does not sleep."""
+
+    def __init__(self, stamps: Stamps) -> None:
+        super().__init__()
+        self._stamps = stamps
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        sleeps = timeout is None or timeout > 0
+        self._stamps.add("select" if sleeps else "again")
+        events = super().select(timeout)
+        self._stamps.add("selected" if sleeps else "polled")
+        return events
+
+
+@dataclass
+class StampedLoop:
+    """Makes loops whose selector and timers are stamped; not every call makes a timer."""
+
+    stamps: Stamps = field(default_factory=Stamps)
+
+    def __call__(self) -> asyncio.AbstractEventLoop:
+        stamps = self.stamps
+
+        class Loop(asyncio.SelectorEventLoop):
+            def call_at(
+                self,
+                when: float,
+                callback: Callable[[*Args], object],
+                *args: *Args,
+                context: Context | None = None,
+            ) -> asyncio.TimerHandle:
+                stamps.add("timer")
+                timer = super().call_at(when, callback, *args, context=context)
+                stamps.add("armed")
+                return timer
+
+        return Loop(StampedSelector(stamps))
+
+
+def profile(calls: int) -> Profile:
+    """Measures calls one at a time, on asyncio and the direct bridge, to a bare server."""
+    work = Work(server="lean", srv_name="/bench/profile")
+    loop_factory = StampedLoop()
+    server = Child("benchmarks.server")
+    with server, asyncio.Runner(loop_factory=loop_factory) as runner:
+        server.ask("serve", work=work.to_json(), timeout=READY_TIMEOUT)
+        found = runner.run(_measure(work, calls, loop_factory.stamps))
+        server.ask("end", timeout=PATIENCE)
+    return found
+
+
+async def _measure(work: Work, calls: int, stamps: Stamps) -> Profile:
+    plain: list[int] = []
+    stamped: list[Sequence[tuple[str, int]]] = []
+    request = make_request(work)
+    async with rosasync.Session("profile", bridge="direct", timeout=CALL_TIMEOUT) as session:
+        client = session.client(load_type(work.srv_type), work.names[0])
+        await client.wait(READY_TIMEOUT)
+        for _ in range(WARM_UP):
+            await client.call(request)
+        for number in range(2 * calls):
+            if number // ROUND % 2:
+                with _stamping(session, stamps):
+                    stamps.add("await")
+                    await client.call(request)
+                    stamps.add("answer")
+                stamped.append(tuple(stamps.taken))
+                stamps.taken.clear()
+            else:
+                begin = time.perf_counter_ns()
+                await client.call(request)
+                plain.append(time.perf_counter_ns() - begin)
+    return _summary(stamped, plain)
+
+
+@contextmanager
+def _stamping(session: rosasync.Session, stamps: Stamps) -> Iterator[None]:
+    """Puts stamps where the session's one client touches the middleware, for one call."""
+    pool: Any = session.pool
+    (endpoint,) = pool._endpoints.values()
+    port: Any = endpoint.clients[0]._port
+    kept = (port.send_request, port._take, port._deliver, os.eventfd_read)
+    pool._release = stamps.around(pool._release, "resumed", "released")
+    port.send_request = stamps.around(port.send_request, "send", "sent")
+    port._take = stamps.around(port._take, "take", "taken")
+    port._deliver = stamps.around(port._deliver, "deliver", "delivered")
+    os.eventfd_read = stamps.around(os.eventfd_read, "read", "counted")
+    stamps.on = True
+    try:
+        yield
+    finally:
+        stamps.on = False
+        del pool._release
+        port.send_request, port._take, port._deliver, os.eventfd_read = kept
+
+
+def _summary(stamped: list[Sequence[tuple[str, int]]], plain: list[int]) -> Profile:
+    """Of the path that most calls took."""
+    paths = Counter(tuple(name for name, _ in stamps) for stamps in stamped)
+    path, calls = paths.most_common(1)[0]
+    if unknown := set(pairwise(path)) - set(STAGES):
+        raise RuntimeError(f"stages {unknown} are not known here: the profile is out of date")
+    usual = [stamps for stamps in stamped if tuple(name for name, _ in stamps) == path]
+    rows = np.array([[ns for _, ns in stamps] for stamps in usual])
+    medians = np.median(np.diff(rows), axis=0) / 1e3
+    return Profile(
+        {STAGES[pair]: float(us) for pair, us in zip(pairwise(path), medians, strict=True)},
+        float(np.median(rows[:, -1] - rows[:, 0])) / 1e3,
+        float(np.median(plain)) / 1e3,
+        calls,
+        len(stamped) - calls,
+    )

@@ -1,0 +1,73 @@
+"""The servers beside stock rclpy's plain one: its async handler, and rosasync's of each kind."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, Literal
+
+import uvloop
+
+import rosasync
+from benchmarks.work import Work, load_type, make_handler, make_qos
+
+__all__ = ["SERVERS", "async_handler", "rosasync_server"]
+
+
+def async_handler(work: Work) -> Callable[[Any, Any], Any]:
+    """The handler of `make_handler` as a coroutine function."""
+    plain = make_handler(work)
+
+    async def handler(request: Any, response: Any) -> Any:
+        return plain(request, response)
+
+    return handler
+
+
+@contextmanager
+def rosasync_server(work: Work) -> Iterator[None]:
+    """Serves `work` in a loop of its own, in a thread."""
+    started: threading.Event = threading.Event()
+    ending: list[Callable[[], object]] = []
+    thread = threading.Thread(target=_run, args=(work, started, ending))
+    thread.start()
+    started.wait()
+    try:
+        yield
+    finally:
+        ending[0]()
+        thread.join()
+
+
+def _run(work: Work, started: threading.Event, ending: list[Callable[[], object]]) -> None:
+    kind = SERVERS[work.server]
+    loop_factory = uvloop.new_event_loop if kind.endswith("uvloop") else None
+    with asyncio.Runner(loop_factory=loop_factory) as runner:
+        runner.run(_serve(work, kind, started, ending))
+
+
+async def _serve(
+    work: Work, kind: str, started: threading.Event, ending: list[Callable[[], object]]
+) -> None:
+    bridge: Literal["direct", "executor"] = "executor" if "executor" in kind else "direct"
+    handler = make_handler(work) if "plain" in kind else async_handler(work)
+    qos = None if work.depth is None else make_qos(work.depth)
+    over = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    async with rosasync.Session("bench_server", bridge=bridge) as session:
+        for name in work.names:
+            session.serve(load_type(work.srv_type), name, handler, qos=qos)
+        ending.append(lambda: loop.call_soon_threadsafe(over.set))
+        started.set()
+        await over.wait()
+
+
+SERVERS = {
+    "rosasync": "direct, async",
+    "rosasync-uvloop": "direct, async, uvloop",
+    "rosasync-plain": "direct, plain",
+    "rosasync-executor": "executor, async",
+}
+"""What the name of a server means: bridge, handler, loop."""

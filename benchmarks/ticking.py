@@ -1,0 +1,276 @@
+"""Trees whose leaves call services, and what is timed about their ticks."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Generator, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol, TypeAlias
+
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
+
+from benchmarks.contestants.base import Tally
+from benchmarks.work import CALL_TIMEOUT, Work
+
+__all__ = [
+    "Leaf",
+    "Stamps",
+    "TickTally",
+    "Ticked",
+    "Ticking",
+    "Ticks",
+    "call_timeout",
+    "drive_in_loop",
+    "watch_rclpy",
+]
+
+now = time.perf_counter_ns
+
+Ticks: TypeAlias = Iterator[float]
+"""Yields where a tick is over: the seconds until the next one."""
+
+PERIOD = 0.001
+"""Seconds between two ticks."""
+
+PENDING_TIMEOUT = 120.0
+"""Seconds for which a call to a server that does not answer stays pending."""
+
+BATCH = 100
+"""Looks at a state for one sample: one alone takes less time than the clock."""
+
+
+class Leaf(Protocol):
+    """One leaf of a tree, with one call at a time."""
+
+    def start(self) -> None:
+        """Starts a call."""
+
+    def look(self) -> bool:
+        """Whether the call has ended; raises what it ended in, unless that is an answer."""
+
+    def state(self) -> object:
+        """The state alone, as `look` looks at it."""
+
+
+class Ticking(Protocol):
+    """A contestant whose calls are made by the leaves of a tree."""
+
+    def tick(self, measure: str, leaves: int, calls: int, seconds: float) -> TickTally:
+        """Measures one of the things `Ticked` knows."""
+
+
+def call_timeout(work: Work) -> float:
+    """Seconds for a call: those of a slow server are to stay pending."""
+    return PENDING_TIMEOUT if any(work.delays) else CALL_TIMEOUT
+
+
+@dataclass
+class TickTally(Tally):
+    """What came of a run of ticks.
+
+    Attributes:
+        added: threads and descriptors in use beyond those before the leaves were made.
+    """
+
+    added: dict[str, int] = field(default_factory=dict)
+
+
+@dataclass
+class Stamps:
+    """When the last request was handed to the middleware, and the last response taken from it."""
+
+    sent: int = 0
+    taken: int = 0
+
+
+def watch_rclpy() -> Stamps:
+    """Has every client of this process stamp what it sends and takes, whoever calls it."""
+    stamps = Stamps()
+    send, take = _rclpy.Client.send_request, _rclpy.Client.take_response
+
+    def send_request(self: Any, request: Any) -> Any:
+        number = send(self, request)
+        stamps.sent = now()
+        return number
+
+    def take_response(self: Any, response_type: Any) -> Any:
+        taken = take(self, response_type)
+        if taken[0] is not None:
+            stamps.taken = now()
+        return taken
+
+    _rclpy.Client.send_request = send_request
+    _rclpy.Client.take_response = take_response
+    return stamps
+
+
+class Ticked(ABC):
+    """The measures, each written as a generator that yields where a tick is over.
+
+    ``tick``: how long a tick takes in which every leaf looks at a pending call. ``state``: one
+    look at the state of a pending call. ``decide``: from the leaf's decision to the request in the
+    middleware's hands. ``see``: from the response out of the middleware's hands to the tick that
+    sees it, with ticks back to back. ``rate``: calls by as many leaves as there are, each starting
+    the next call in the tick that sees the answer. ``added``: threads and descriptors in use with
+    a call pending in every leaf.
+    """
+
+    stamps: Stamps
+
+    @abstractmethod
+    def setup(self, work: Work) -> None:
+        """Makes ready for `work`, and returns when its server was found."""
+
+    @abstractmethod
+    def leaf(self) -> Leaf:
+        """Makes a leaf."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Takes down what `setup` and the leaves made."""
+
+    def tick(self, measure: str, leaves: int, calls: int, seconds: float) -> TickTally:
+        return self._run(measure, leaves, calls, seconds, TickTally())
+
+    def pending(self, leaves: Sequence[Leaf]) -> Callable[[], object]:
+        """What ticks these leaves once, each of which has a call pending."""
+
+        def tick() -> None:
+            for leaf in leaves:
+                leaf.look()
+
+        return tick
+
+    def drive(self, ticks: Ticks) -> None:
+        """Takes one tick after the other, sleeping in between; here in this thread."""
+        for seconds in ticks:
+            time.sleep(seconds)
+
+    def _run(
+        self, measure: str, leaves: int, calls: int, seconds: float, tally: TickTally
+    ) -> TickTally:
+        ticks: Ticks = getattr(self, f"_measure_{measure}")(leaves, calls, seconds, tally)
+        with tally.timed():
+            self.drive(ticks)
+        return tally
+
+    def _measure_tick(self, leaves: int, calls: int, seconds: float, tally: TickTally) -> Ticks:
+        tree = yield from self._all_pending(leaves)
+        tick = self.pending(tree)
+        until = _until(seconds)
+        for _ in range(calls):
+            begin = now()
+            tick()
+            tally.samples.append((end := now()) - begin)
+            if end > until:
+                return
+            yield 0.0
+
+    def _measure_state(self, leaves: int, calls: int, seconds: float, tally: TickTally) -> Ticks:
+        (leaf,) = yield from self._all_pending(1)
+        look = leaf.state
+        until = _until(seconds)
+        for _ in range(calls):
+            begin = now()
+            for _ in range(BATCH):
+                look()
+            tally.samples.append(((end := now()) - begin) // BATCH)
+            if end > until:
+                return
+            yield 0.0
+
+    def _measure_decide(self, leaves: int, calls: int, seconds: float, tally: TickTally) -> Ticks:
+        leaf = self.leaf()
+        until = _until(seconds)
+        for _ in range(calls):
+            if (decided := now()) > until:
+                return
+            leaf.start()
+            yield PERIOD
+            if (yield from self._ended(leaf, PERIOD, tally)):
+                tally.samples.append(self.stamps.sent - decided)
+
+    def _measure_see(self, leaves: int, calls: int, seconds: float, tally: TickTally) -> Ticks:
+        leaf = self.leaf()
+        until = _until(seconds)
+        for _ in range(calls):
+            if now() > until:
+                return
+            leaf.start()
+            yield 0.0
+            if (yield from self._ended(leaf, 0.0, tally)):
+                tally.samples.append(now() - self.stamps.taken)
+
+    def _measure_rate(self, leaves: int, calls: int, seconds: float, tally: TickTally) -> Ticks:
+        until = _until(seconds)
+        tree = [self.leaf() for _ in range(leaves)]
+        out: dict[Leaf, int] = {}
+        started = 0
+        while True:
+            for leaf in tree:
+                if leaf in out:
+                    if (ended := _look(leaf, tally)) is None:
+                        continue
+                    begin = out.pop(leaf)
+                    if ended:
+                        tally.samples.append(now() - begin)
+                if started < calls and (begin := now()) < until:
+                    out[leaf] = begin
+                    started += 1
+                    leaf.start()
+            if not out:
+                return
+            yield PERIOD
+
+    def _measure_added(self, leaves: int, calls: int, seconds: float, tally: TickTally) -> Ticks:
+        before = _used()
+        yield from self._all_pending(leaves)
+        until = _until(seconds)
+        most = before
+        while now() < until:
+            most = tuple(max(pair) for pair in zip(most, _used(), strict=True))
+            yield 10 * PERIOD
+        threads, descriptors = (m - b for m, b in zip(most, before, strict=True))
+        tally.added = {"threads": threads, "descriptors": descriptors}
+
+    def _all_pending(self, leaves: int) -> Generator[float, None, list[Leaf]]:
+        tree = [self.leaf() for _ in range(leaves)]
+        for leaf in tree:
+            leaf.start()
+        for _ in range(100):
+            yield PERIOD
+        if any(leaf.look() for leaf in tree):
+            raise RuntimeError("a call was answered that was to stay pending")
+        return tree
+
+    def _ended(self, leaf: Leaf, period: float, tally: TickTally) -> Generator[float, None, bool]:
+        while (ended := _look(leaf, tally)) is None:
+            yield period
+        return ended
+
+
+async def drive_in_loop(ticks: Ticks) -> None:
+    """Takes one tick after the other, and gives the loop its turn in between."""
+    for seconds in ticks:
+        await asyncio.sleep(seconds)
+
+
+def _look(leaf: Leaf, tally: TickTally) -> bool | None:
+    """Whether the call was answered; None while it is pending."""
+    try:
+        return leaf.look() or None
+    except Exception as exc:
+        tally.miss(exc)
+        return False
+
+
+def _until(seconds: float) -> int:
+    return now() + round(seconds * 1e9)
+
+
+def _used() -> tuple[int, ...]:
+    """Threads and descriptors of this process."""
+    return len(os.listdir("/proc/self/task")), len(os.listdir("/proc/self/fd"))

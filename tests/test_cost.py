@@ -1,0 +1,186 @@
+"""What one call costs, counted and not timed: Python function calls, and objects left behind.
+
+The bounds are a little above what was counted when they were set. A count above its bound means
+that every call now does more than it did: take it away again, or, where it is worth its price,
+raise the bound in the same change that makes it necessary. ``benchmarks profile`` says what that
+price is in time.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import statistics
+import sys
+import tracemalloc
+from array import array
+from collections import Counter
+from collections.abc import Awaitable, Callable
+from dataclasses import astuple, dataclass, replace
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+import rosasync
+from rosasync import Session
+from tests.support.echo import ECHO, request_of
+from tests.support.times import LIMIT
+
+if TYPE_CHECKING:
+    from rosasync.testing import FakeGraph
+
+CALLS = 150
+BATCHES = 4
+WARM_UP = 200
+AT_ONCE = 10
+Call = Callable[[], Awaitable[object]]
+OWN = rosasync.__path__[0]
+
+
+class Echo:
+    """A service of plain Python."""
+
+    class Request:
+        pass
+
+    class Response:
+        pass
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What one call costs.
+
+    Attributes:
+        functions: of the library that are entered; a coroutine once more when it is resumed.
+        c_functions: of C that those call.
+        peak: most bytes in use meanwhile, above those before the call, says tracemalloc.
+        left: bytes that stay in use, in the batch of calls after which the least did: timers that
+            were cancelled are cleared away now and then.
+        cycles: objects that only the garbage collector frees.
+    """
+
+    functions: float
+    c_functions: float
+    peak: float
+    left: float
+    cycles: float
+
+    def __le__(self, bound: Cost) -> bool:
+        return all(a <= b for a, b in zip(astuple(self), astuple(bound), strict=True))
+
+
+FAKE = Cost(functions=15, c_functions=9, peak=2000, left=100, cycles=0)
+"""On the fake graph, whose own lists of what was sent grow with every call."""
+BOUNDS = {
+    "direct": Cost(functions=18, c_functions=13, peak=1700, left=50, cycles=0),
+    "executor": Cost(functions=18, c_functions=11, peak=6300, left=50, cycles=0),
+}
+"""rclpy's part is in the bytes, not in the functions."""
+
+
+async def cost_of(call: Call, calls: int = 1) -> Cost:
+    """Measure calls one after the other, or several ``calls`` at once; medians for each."""
+    for _ in range(WARM_UP):
+        await call()
+    functions, c_functions = await _count_functions(call)
+    peak, left, cycles = await _count_memory(call)
+    counts = (functions, c_functions, peak, left, cycles)
+    return Cost(*(count / calls for count in counts))
+
+
+async def _count_functions(call: Call) -> tuple[float, float]:
+    entered, c_entered = [], []
+    counts: Counter[str] = Counter()
+
+    def on_event(frame: FrameType, event: str, arg: Any) -> None:
+        name = frame.f_code.co_filename
+        if name.startswith(OWN) and not name.endswith("testing.py"):
+            counts[event] += 1
+
+    sys.setprofile(on_event)
+    try:
+        for _ in range(CALLS):
+            counts.clear()
+            await call()
+            entered.append(counts["call"])
+            c_entered.append(counts["c_call"])
+    finally:
+        sys.setprofile(None)
+    return statistics.median(entered), statistics.median(c_entered)
+
+
+async def _count_memory(call: Call) -> tuple[float, float, float]:
+    peaks = array("q", bytes(8 * CALLS))
+    left = []
+    gc.collect()
+    gc.disable()
+    tracemalloc.start()
+    try:
+        for _ in range(WARM_UP):
+            await call()
+        for _ in range(BATCHES):
+            start = tracemalloc.get_traced_memory()[0]
+            for number in range(CALLS):
+                tracemalloc.reset_peak()
+                before = tracemalloc.get_traced_memory()[0]
+                await call()
+                peaks[number] = tracemalloc.get_traced_memory()[1] - before
+            left.append(tracemalloc.get_traced_memory()[0] - start)
+        cycles = gc.collect()
+    finally:
+        tracemalloc.stop()
+        gc.enable()
+    return statistics.median(peaks), min(left) / CALLS, cycles // (BATCHES * CALLS)
+
+
+async def test_a_call_on_the_fake_graph(fake_graph: FakeGraph) -> None:
+    fake_graph.serve(Echo, "/echo", lambda request: Echo.Response())
+    request = Echo.Request()
+    async with fake_graph.session() as session:
+        client = session.client(Echo, "/echo")
+        assert await cost_of(lambda: client.call(request)) <= FAKE
+        by_name = replace(FAKE, functions=FAKE.functions + 1)
+        assert await cost_of(lambda: session.call(Echo, "/echo", request)) <= by_name
+
+
+async def test_a_call_one_at_a_time(session: Session, echo: str) -> None:
+    request = request_of("x")
+    client = session.client(ECHO, echo)
+    await client.wait(LIMIT)
+    assert await cost_of(lambda: client.call(request)) <= BOUNDS[session.bridge]
+
+
+async def test_one_of_ten_calls_at_once(session: Session, echo: str) -> None:
+    request = request_of("x")
+    client = session.client(ECHO, echo)
+    await client.wait(LIMIT)
+
+    async def ten() -> None:
+        await asyncio.gather(*(client.call(request) for _ in range(AT_ONCE)))
+
+    # Now and then the loop looks for a response that it has taken with another one already.
+    bound = BOUNDS[session.bridge]
+    assert await cost_of(ten, AT_ONCE) <= replace(bound, functions=bound.functions + 1)
+
+
+async def test_what_is_more_is_noticed(fake_graph: FakeGraph) -> None:
+    fake_graph.serve(Echo, "/echo", lambda request: Echo.Response())
+    request = Echo.Request()
+    kept: list[Any] = []
+    async with fake_graph.session() as session:
+        client = session.client(Echo, "/echo")
+
+        async def twice() -> None:
+            await client.call(request)
+            await client.call(request)
+
+        async def kept_call() -> None:
+            kept.append([await client.call(request), bytearray(100)])
+
+        async def cyclic_call() -> None:
+            cycle: list[Any] = [await client.call(request)]
+            cycle.append(cycle)
+
+        assert (await cost_of(twice)).functions == 2 * FAKE.functions
+        assert (await cost_of(kept_call)).left > FAKE.left
+        assert (await cost_of(cyclic_call)).cycles > FAKE.cycles
