@@ -7,16 +7,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from rosasync.deadlines import Deadlines
 from rosasync.limits import Limits, Retry
 
 if TYPE_CHECKING:
     from rosasync.ros.ports import ClientPort, Deliver
 
-__all__ = ["Client", "Counts", "Expired"]
-
-
-class Expired(Exception):
-    """The deadline passed: for the pool to turn into an error that tells the phase."""
+__all__ = ["Client", "Counts"]
 
 
 @dataclass(slots=True)
@@ -45,6 +42,7 @@ class Client:
 
     __slots__ = (
         "_abandoned",
+        "_deadlines",
         "_grace_timer",
         "_loop",
         "_on_room",
@@ -65,11 +63,13 @@ class Client:
         limits: Limits,
         counts: Counts,
         on_room: Callable[[], None],
+        deadlines: Deadlines,
     ) -> None:
         self._loop = asyncio.get_running_loop()
         self._window = limits.in_flight
         self.grace = limits.grace
         self._on_room = on_room
+        self._deadlines = deadlines
         self._pending: dict[int, asyncio.Future[Any]] = {}
         self._abandoned: dict[int, float] = {}
         self._grace_timer: asyncio.TimerHandle | None = None
@@ -117,8 +117,7 @@ class Client:
             Expired: the deadline passed.
             Exception: what `fail` was given while the request was out.
         """
-        loop = self._loop
-        future: asyncio.Future[Any] = loop.create_future()
+        future: asyncio.Future[Any] = self._loop.create_future()
         pending = self._pending
         sequence_number = self._port.send(request)
         pending[sequence_number] = future
@@ -126,7 +125,7 @@ class Client:
         counts.in_flight += 1
         if counts.in_flight > counts.peak:
             counts.peak = counts.in_flight
-        timer = None if deadline is None else loop.call_at(deadline, _expire, future)
+        entry = None if deadline is None else self._deadlines.set(future, deadline)
         resend = None if retry is None else _Resend(self, request, future, retry, sequence_number)
         try:
             return await future
@@ -137,8 +136,8 @@ class Client:
             raise
         finally:
             counts.in_flight -= 1
-            if timer is not None:
-                timer.cancel()
+            if entry is not None:
+                self._deadlines.met(entry)
             if resend is not None:
                 resend.end()
             elif pending.pop(sequence_number, None) is not None:
@@ -258,8 +257,3 @@ class _Resend:
         answered = max((n for n in self._sent if n not in self._client._pending), default=-1)
         for sequence_number in self._sent:
             self._client._withdraw(sequence_number, still_queued=sequence_number > answered)
-
-
-def _expire(future: asyncio.Future[Any]) -> None:
-    if not future.done():
-        future.set_exception(Expired())

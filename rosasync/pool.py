@@ -11,7 +11,8 @@ from contextlib import asynccontextmanager, suppress
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from rosasync.client import Client, Counts, Expired
+from rosasync.client import Client, Counts
+from rosasync.deadlines import Deadlines, Expired
 from rosasync.errors import (
     CallError,
     ContextShutdown,
@@ -149,6 +150,7 @@ class ClientPool:
         self._endpoints: dict[ServiceKey, Endpoint] = {}
         self._shortcuts: dict[tuple[Any, str, Any], Endpoint] = {}
         self._graph = 0
+        self._deadlines = Deadlines()
         self._look_timer: asyncio.TimerHandle | None = None
         self._look_delay = FIRST_LOOK
         self._evict_timer: asyncio.TimerHandle | None = None
@@ -331,6 +333,7 @@ class ClientPool:
         for timer in (self._look_timer, self._evict_timer):
             if timer is not None:
                 timer.cancel()
+        self._deadlines.close()
         for endpoint in self._endpoints.values():
             callers: tuple[asyncio.Future[Any], ...] = (
                 *endpoint.waiters,
@@ -490,12 +493,12 @@ class ClientPool:
             return future.result()
         if self._awaits_match(endpoint):
             self._look_soon()
-        timer = None if deadline is None else self._loop.call_at(deadline, _expire, future)
+        entry = None if deadline is None else self._deadlines.set(future, deadline)
         try:
             return await future
         finally:
-            if timer is not None:
-                timer.cancel()
+            if entry is not None:
+                self._deadlines.met(entry)
             self._evict_later()
 
     def _release(self, endpoint: Endpoint, client: Client) -> None:
@@ -525,6 +528,7 @@ class ClientPool:
             self._limits,
             endpoint.counts,
             on_room,
+            self._deadlines,
         )
         endpoint.clients.append(client)
         endpoint.counts.created += 1
@@ -722,8 +726,3 @@ class _Gone(Exception):
 def context_shut_down() -> Exception:
     """Make the error that everybody gets when the context goes down."""
     return ContextShutdown("the rclpy context was shut down, or the node destroyed")
-
-
-def _expire(future: asyncio.Future[Any]) -> None:
-    if not future.done():
-        future.set_exception(Expired())

@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 
 from rosasync import Limits, Retry
-from rosasync.client import Client, Counts, Expired
+from rosasync.client import Client, Counts
+from rosasync.deadlines import Deadlines, Expired
 from rosasync.testing import FakeClient, FakeGraph, FakeNode
 from tests.support.times import TICK, until
 
@@ -22,7 +23,7 @@ class Rig:
         self.node.attach(lambda: None, lambda: None)
         self.counts = Counts()
         self.room = 0
-        self.client = Client(self._open, Limits(**limits), self.counts, self._on_room)
+        self.client = Client(self._open, Limits(**limits), self.counts, self._on_room, Deadlines())
 
     def _open(self, deliver: Callable[[int, Any], None]) -> FakeClient:
         self.port = FakeClient(self.node, "", "/echo", deliver)

@@ -60,8 +60,11 @@ class Rcl:
 def _set_callback(function: Any, handle: Any, signal: Any, fd: int | None) -> bool:
     if not handle.pointer:
         return False
-    callback, user_data = (None, None) if fd is None else (signal, ctypes.c_void_p(fd))
-    return bool(function(handle.pointer, callback, user_data) == 0)
+    if fd is None:
+        return bool(function(handle.pointer, None, None) == 0)
+    # rmw_fastrtps counts what has come and only then installs its listener: what comes in between
+    # is neither counted nor told of. The second time it is counted.
+    return all(function(handle.pointer, signal, ctypes.c_void_p(fd)) == 0 for _ in range(2))
 
 
 @cache
