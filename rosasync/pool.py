@@ -432,17 +432,10 @@ class ClientPool:
         self.check_open()
         waiter: asyncio.Future[Client] = self._loop.create_future()
         endpoint.waiters[waiter] = None
-        self._serve_line(endpoint)
-        if not waiter.done():
-            # Who gets a place as soon as a client is matched is not in anybody's way.
-            coming = sum(c.room for c in endpoint.clients if c.graph != self._graph)
-            if len(endpoint.waiters) > self._limits.waiting + max(coming, 0):
-                del endpoint.waiters[waiter]
-                raise PoolFull(
-                    f"{endpoint.key.srv_name}: {len(endpoint.waiters)} callers are waiting for a "
-                    f"client, Limits.waiting={self._limits.waiting} allows no more"
-                )
         try:
+            self._serve_line(endpoint)
+            if not waiter.done():
+                self._check_line(endpoint)
             return await self._wait(endpoint, waiter, deadline)
         except BaseException:
             if waiter.done() and not waiter.cancelled() and waiter.exception() is None:
@@ -450,6 +443,18 @@ class ClientPool:
             raise
         finally:
             endpoint.waiters.pop(waiter, None)
+
+    def _check_line(self, endpoint: Endpoint) -> None:
+        """Raise `PoolFull` where the line is too long, with the one who has just joined it.
+
+        Who gets a place as soon as a client is matched is not in anybody's way.
+        """
+        coming = sum(c.room for c in endpoint.clients if c.graph != self._graph)
+        if len(endpoint.waiters) > self._limits.waiting + max(coming, 0):
+            raise PoolFull(
+                f"{endpoint.key.srv_name}: {len(endpoint.waiters) - 1} callers are waiting for a "
+                f"client, Limits.waiting={self._limits.waiting} allows no more"
+            )
 
     async def _reach(
         self, endpoint: Endpoint, started: float, deadline: float | None, wait: bool
@@ -464,7 +469,8 @@ class ClientPool:
         if not wait and not self.is_ready(endpoint):
             if not self._provided(endpoint):
                 raise self._unavailable(endpoint, self._loop.time() - started)
-            await self.wait_for_server(endpoint, MATCHING)
+            left = math.inf if deadline is None else max(0.0, deadline - self._loop.time())
+            await self.wait_for_server(endpoint, min(MATCHING, left))
         try:
             return await self._queue(endpoint, deadline)
         except Expired:

@@ -274,6 +274,23 @@ async def test_pool_full(fake_graph: FakeGraph) -> None:
         assert await asyncio.gather(*tasks) == [0, 1, 2]
 
 
+async def test_a_client_that_cannot_be_made_is_the_callers_error(fake_graph: FakeGraph) -> None:
+    fake_graph.serve(Echo, "/echo", echo)
+    async with opened(fake_graph) as session:
+        node: Any = session.node
+        open_client = node.open_client
+
+        def refuse(*_: object) -> None:
+            raise UsageError("one type per name")
+
+        node.open_client = refuse
+        with pytest.raises(UsageError, match="one type"):
+            await ask(session, 1)
+        assert session.pool.statistics().waiting == 0
+        node.open_client = open_client
+        assert await ask(session, 2) == 2
+
+
 async def test_without_a_line_a_first_call_still_goes_through(fake_graph: FakeGraph) -> None:
     fake_graph.serve(Echo, "/echo", echo)
     async with opened(fake_graph, Limits(waiting=0)) as session:
