@@ -19,7 +19,7 @@ import asyncio
 import itertools
 from collections import deque
 from collections.abc import Callable, Hashable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import Any
@@ -191,43 +191,36 @@ class FakeGraph:
             for node in tuple(self.nodes):
                 node.on_graph()
 
-    @contextmanager
-    def delay_responses(self, seconds: float) -> Iterator[None]:
+    def delay_responses(self, seconds: float) -> AbstractContextManager[None]:
         """Deliver the responses of requests sent meanwhile so much later."""
-        before, self.delay = self.delay, seconds
-        try:
-            yield
-        finally:
-            self.delay = before
+        return self._meanwhile("delay", seconds)
 
-    @contextmanager
-    def drop_requests(self) -> Iterator[None]:
+    def drop_requests(self) -> AbstractContextManager[None]:
         """Lose every request sent meanwhile."""
-        self.dropping_requests = True
-        try:
-            yield
-        finally:
-            self.dropping_requests = False
+        return self._meanwhile("dropping_requests", True)
 
-    @contextmanager
-    def drop_responses(self) -> Iterator[None]:
+    def drop_responses(self) -> AbstractContextManager[None]:
         """Lose the response of every request handled meanwhile."""
-        self.dropping_responses = True
-        try:
-            yield
-        finally:
-            self.dropping_responses = False
+        return self._meanwhile("dropping_responses", True)
 
     @contextmanager
     def hold_requests(self) -> Iterator[None]:
         """Have the servers handle nothing meanwhile, and everything they could queue afterwards."""
-        self.holding = True
+        try:
+            with self._meanwhile("holding", True):
+                yield
+        finally:
+            for server in tuple(self.servers):
+                server._work()
+
+    @contextmanager
+    def _meanwhile(self, name: str, value: object) -> Iterator[None]:
+        before = getattr(self, name)
+        setattr(self, name, value)
         try:
             yield
         finally:
-            self.holding = False
-            for server in tuple(self.servers):
-                server._work()
+            setattr(self, name, before)
 
     def find(self, srv_type: str, srv_name: str) -> list[FakeServer]:
         """Return the servers of this type's name and this name."""
