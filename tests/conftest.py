@@ -17,6 +17,7 @@ from rosasync import Session
 from rosasync.ros.domain import isolate
 from tests.support.clients import ClientProcess
 from tests.support.servers import ServerProcess
+from tests.support.times import TICK
 
 isolate()
 
@@ -43,6 +44,9 @@ def nothing_left_behind(caplog: pytest.LogCaptureFixture) -> Iterator[None]:
     """No test leaves a thread behind, or an exception that only asyncio's logger heard of."""
     before = set(threading.enumerate())
     yield
+    # asyncio's own, that wait for a child, end a moment after it.
+    for thread in set(threading.enumerate()) - before:
+        thread.join(10 * TICK)
     assert set(threading.enumerate()) <= before
     records = [*caplog.get_records("setup"), *caplog.get_records("call")]
     errors = [r for r in records if r.name == "asyncio" and r.levelno >= logging.ERROR]
