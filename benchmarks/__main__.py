@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from json import dumps
 from pathlib import Path
 from typing import Annotated
 
@@ -11,6 +10,7 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
+from benchmarks.allocations import measure_allocations, show_allocations
 from benchmarks.machine import describe_machine
 from benchmarks.results import Results
 from benchmarks.runner import Runner
@@ -18,7 +18,7 @@ from benchmarks.suites import SUITES, make_suite
 from benchmarks.tables import scenario_table, target_table
 from rosasync.ros.domain import isolate
 
-ROUNDS, QUICK_ROUNDS = 9, 5
+ROUNDS, QUICK_ROUNDS, ALLOCATION_ROUNDS = 9, 5, 3
 PINNED_CORES = 4
 WIDTH = 180
 
@@ -154,19 +154,14 @@ def memory(
 
 
 @app.command()
-def allocations(quick: Quick = False, json: Json = None) -> None:
+def allocations(quick: Quick = False, rounds: Rounds = None, json: Json = None) -> None:
     """Python objects and bytes of a call and of a request, and what stays of many."""
-    from benchmarks.allocations import measure_allocations, show_allocations
-
     isolate()
-    console = make_console()
-    with Progress(console=console) as progress:
-        found = measure_allocations(quick=quick, progress=progress)
-    for table in show_allocations(found):
-        console.print(table)
-    if json:
-        json.parent.mkdir(parents=True, exist_ok=True)
-        json.write_text(dumps({"machine": describe_machine(), "allocations": found}))
+    rounds = rounds or (1 if quick else ALLOCATION_ROUNDS)
+    settings = {"suites": ["allocations"], "quick": quick, "rounds": rounds, "pin": False}
+    results = Results(describe_machine(), settings)
+    look_at_allocations(results, quick, rounds)
+    finish(results, json)
 
 
 @app.command("all")
@@ -178,7 +173,8 @@ def everything(
     pin: Pin = None,
 ) -> None:
     """Everything there is to measure."""
-    measure([name for name in SUITES if name != "targets"], quick, rounds, json, contestants, pin)
+    suites = [name for name in SUITES if name != "targets"]
+    measure(suites, quick, rounds, json, contestants, pin, and_allocations=True)
 
 
 @app.command()
@@ -218,6 +214,8 @@ def measure(
     json: Path | None,
     contestants: str,
     pin: bool | None,
+    *,
+    and_allocations: bool = False,
 ) -> None:
     chosen = [key.strip() for key in contestants.split(",") if key.strip()]
     try:
@@ -237,9 +235,20 @@ def measure(
             Runner(rounds, pin, results, progress) as runner,
         ):
             runner.run(list(scenarios.values()))
+        if and_allocations:
+            look_at_allocations(results, quick, 1 if quick else ALLOCATION_ROUNDS)
     except KeyboardInterrupt:
         console.print("interrupted: these are the rounds that ended")
-    show(console, results)
+    finish(results, json)
+
+
+def look_at_allocations(results: Results, quick: bool, rounds: int) -> None:
+    with Progress(console=make_console()) as progress:
+        measure_allocations(results, quick=quick, rounds=rounds, progress=progress)
+
+
+def finish(results: Results, json: Path | None) -> None:
+    show(make_console(), results)
     if json:
         results.save(json)
 
@@ -254,6 +263,8 @@ def show(console: Console, results: Results) -> None:
     for scenario in results.scenarios:
         if results.contestants(scenario):
             console.print(scenario_table(results, scenario))
+    for table in show_allocations(results):
+        console.print(table)
     targets = target_table(results)
     if targets:
         console.print(targets)

@@ -17,6 +17,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import AsyncExitStack, ExitStack, contextmanager
 from functools import partial
+from statistics import median
 from typing import Any, Literal
 
 from rich.box import SIMPLE
@@ -27,10 +28,11 @@ import rosasync
 from benchmarks.contestants.base import spinning
 from benchmarks.meter import resident_bytes
 from benchmarks.pipes import Child, answer_lines
+from benchmarks.results import Results
 from benchmarks.server import Server
 from benchmarks.work import READY_TIMEOUT, Work, load_type, make_request
 
-__all__ = ["measure_allocations", "show_allocations"]
+__all__ = ["allocation_rows", "measure_allocations", "show_allocations"]
 
 OUT = 200
 """Calls that are out at once while what they hold is counted; they last ``SLOW`` seconds."""
@@ -53,6 +55,7 @@ SERVED = {
 }
 
 Row = dict[str, float]
+Found = dict[str, dict[str, Row]]
 
 
 class Caller(ABC):
@@ -235,21 +238,23 @@ def traced() -> tuple[int, int]:
     return len(traces), sum(trace.size for trace in traces)
 
 
-def measure_allocations(*, quick: bool, progress: Progress) -> dict[str, dict[str, Row]]:
-    """Looks at every client and server; each in a process of its own."""
+def measure_allocations(results: Results, *, quick: bool, rounds: int, progress: Progress) -> None:
+    """Looks at every client and server, each in a process of its own, once in each round."""
     calls = QUICK_CALLS if quick else CALLS
-    task = progress.add_task("", total=len(CLIENTS) + len(SERVED))
-    found: dict[str, dict[str, Row]] = {"clients": {}, "servers": {}}
-    for part, kinds, measure in (
-        ("clients", CLIENTS, _measure_client),
-        ("servers", SERVED, _measure_server),
-    ):
-        for number, kind in enumerate(kinds):
-            progress.update(task, description=f"{part}: {kind}")
-            work = Work(server="lean", services=2, delays=(0.0, SLOW), srv_name=f"/{part}_{number}")
-            found[part][kind] = measure(kind, work, calls)
-            progress.advance(task)
-    return found
+    task = progress.add_task("", total=rounds * (len(CLIENTS) + len(SERVED)))
+    for _ in range(rounds):
+        found: Found = {"clients": {}, "servers": {}}
+        for part, kinds, measure in (
+            ("clients", CLIENTS, _measure_client),
+            ("servers", SERVED, _measure_server),
+        ):
+            for number, kind in enumerate(kinds):
+                progress.update(task, description=f"{part}: {kind}")
+                name = f"/{part}_{number}"
+                work = Work(server="lean", services=2, delays=(0.0, SLOW), srv_name=name)
+                found[part][kind] = measure(kind, work, calls)
+                progress.advance(task)
+        results.allocations.append(found)
 
 
 def _measure_client(kind: str, work: Work, calls: int) -> Row:
@@ -306,19 +311,32 @@ COLUMNS: dict[str, tuple[str, str]] = {
 }
 
 
-def show_allocations(found: dict[str, dict[str, Row]]) -> Iterator[Table]:
+def allocation_rows(results: Results, part: str) -> tuple[list[str], list[list[str]]]:
+    """Heading and rows for ``clients`` or ``servers``: the medians over the rounds."""
+    labels = CLIENTS if part == "clients" else SERVED
+    found = [measured[part] for measured in results.allocations]
+    keys = [key for key in COLUMNS if any(key in row for row in found[0].values())]
+    if part == "servers":
+        keys.remove("pending")
+    body = [
+        [
+            labels[kind],
+            *(COLUMNS[key][1].format(median(kinds[kind][key] for kinds in found)) for key in keys),
+        ]
+        for kind in found[0]
+    ]
+    return ["", *(COLUMNS[key][0] for key in keys)], body
+
+
+def show_allocations(results: Results) -> Iterator[Table]:
     """A table for the clients and one for the servers."""
-    for part, labels in (("clients", CLIENTS), ("servers", SERVED)):
-        rows = found[part]
-        keys = [key for key in COLUMNS if any(key in row for row in rows.values())]
-        if part == "servers":
-            keys.remove("pending")
+    for part in results.allocations[0] if results.allocations else ():
+        heading, body = allocation_rows(results, part)
         table = Table(title=f"[bold]{part}[/]", title_justify="left", box=SIMPLE)
-        table.add_column("")
-        for key in keys:
-            table.add_column(COLUMNS[key][0], justify="right")
-        for kind, row in rows.items():
-            table.add_row(labels[kind], *(COLUMNS[key][1].format(row[key]) for key in keys))
+        for number, name in enumerate(heading):
+            table.add_column(name, justify="right" if number else "left")
+        for row in body:
+            table.add_row(*row)
         yield table
 
 

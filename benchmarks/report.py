@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from benchmarks.allocations import allocation_rows
 from benchmarks.contestants import CONTESTANTS
 from benchmarks.figures import METRICS
 from benchmarks.results import Results, Turn
@@ -54,6 +55,8 @@ def write_report(results: Results, out: Path) -> Path:
         if scenario in plots:
             picture = plots[scenario].relative_to(out)
             sections.append(f"![{scenario}]({picture})\n")
+    for part in results.allocations[0] if results.allocations else ():
+        sections += [f"## Allocations: {part}\n", _markdown(*allocation_rows(results, part))]
     page.write_text("\n".join(sections))
     return page
 

@@ -68,6 +68,7 @@ class Results:
         scenarios: for each scenario, in the order they ran, what it was: title, group and work.
         skipped: why a scenario could not be run on this machine.
         settings: how the run was asked for.
+        allocations: for each round, for ``clients`` and ``servers``, what each kind needed.
     """
 
     machine: dict[str, Any]
@@ -75,6 +76,7 @@ class Results:
     scenarios: dict[str, dict[str, Any]] = field(default_factory=dict)
     turns: list[Turn] = field(default_factory=list)
     skipped: dict[str, str] = field(default_factory=dict)
+    allocations: list[dict[str, dict[str, dict[str, float]]]] = field(default_factory=list)
 
     def of(self, scenario: str, contestant: str) -> list[Turn]:
         return [t for t in self.turns if (t.scenario, t.contestant) == (scenario, contestant)]
@@ -95,6 +97,7 @@ class Results:
             "scenarios": self.scenarios,
             "turns": [turn.to_json() for turn in self.turns],
             "skipped": self.skipped,
+            "allocations": self.allocations,
         }
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(data, separators=(",", ":")))
@@ -117,6 +120,7 @@ class Results:
             merged.scenarios |= data["scenarios"]
             merged.turns += turns
             merged.skipped |= data.get("skipped", {})
+            merged.allocations += data.get("allocations", [])
         if merged is None:
             raise ValueError("no results to read")
         return merged
