@@ -585,6 +585,7 @@ class ServiceServer:
                     self._name,
                     len(stubborn),
                 )
+        await asyncio.sleep(self._port.linger)
         self.end(functools.partial(SessionClosed, f"{self._name}: the server is closed"))
 
 

@@ -111,6 +111,7 @@ class FakeService(FakeServer):
 
     handle = None
     qos = None
+    linger = 0.0
 
     def __init__(
         self, graph: FakeGraph, srv_type: Any, srv_name: str, deliver: DeliverRequest

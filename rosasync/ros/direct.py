@@ -16,7 +16,11 @@ from rosasync.ros.rcl import Rcl
 from rosasync.ros.services import has_clients, make_service, qos_of, send_response, take_requests
 from rosasync.ros.signals import Signal, Signals
 
-__all__ = ["DirectBridge", "Reserved"]
+__all__ = ["LINGER", "DirectBridge", "Reserved"]
+
+LINGER = 0.02
+"""Seconds from the end of signalling to the destruction: a thread of the middleware may be on its
+way into the listener, which it then uses after it was freed (rmw_fastrtps issue 632)."""
 
 
 class Reserved(CallbackGroup):  # type: ignore[misc]
@@ -41,6 +45,7 @@ class DirectBridge:
     """Takes responses and requests on the loop's thread, when the middleware says so."""
 
     name = "direct"
+    linger = LINGER
 
     def __init__(
         self,
@@ -57,6 +62,8 @@ class DirectBridge:
         self._clients: Signals[DirectClient] = Signals(loop, _take_responses)
         self._services: Signals[DirectService] = Signals(loop, _take_requests)
         self._poll = BusyPoll(loop, busy_poll) if busy_poll else None
+        self._loop = loop
+        self._retired: dict[Any, asyncio.TimerHandle] = {}
 
     def open_client(self, srv_type: Any, srv_name: str, qos: Any, deliver: Deliver) -> DirectClient:
         """Make a client whose responses go to ``deliver``, on the loop's thread."""
@@ -64,7 +71,7 @@ class DirectBridge:
             srv_type, srv_name, qos_profile=qos, callback_group=self._group
         )
         self._configure(client)
-        return DirectClient(self._node, client, self._rcl, self._clients, self._poll, deliver)
+        return DirectClient(client, self._rcl, self._clients, self._poll, deliver, self._retire)
 
     def open_service(
         self, srv_type: Any, srv_name: str, qos: Any, deliver: DeliverRequest
@@ -78,10 +85,23 @@ class DirectBridge:
         """Destroy the clients and services that are left, then close the eventfds."""
         for client in self._clients.members:
             client.close()
+        for retired in tuple(self._retired):
+            self._destroy(retired)
         self._clients.close()
         for service in self._services.members:
             service.close()
         self._services.close()
+
+    def _retire(self, client: Any) -> None:
+        """Destroy a client that signals no more, when no thread can be in its listener."""
+        if self._loop.is_closed():
+            self._node.destroy_client(client)
+        else:
+            self._retired[client] = self._loop.call_later(LINGER, self._destroy, client)
+
+    def _destroy(self, client: Any) -> None:
+        self._retired.pop(client).cancel()
+        self._node.destroy_client(client)
 
 
 class DirectClient:
@@ -89,12 +109,13 @@ class DirectClient:
 
     __slots__ = (
         "_client",
+        "_closed",
         "_deliver",
-        "_node",
         "_out",
         "_poll",
         "_rcl",
         "_response_type",
+        "_retire",
         "_signal",
         "_signalling",
         "_signals",
@@ -107,15 +128,16 @@ class DirectClient:
 
     def __init__(
         self,
-        node: Node,
         client: Any,
         rcl: Rcl,
         signals: Signals[DirectClient],
         poll: BusyPoll | None,
         deliver: Deliver,
+        retire: Callable[[Any], None],
     ) -> None:
-        self._node = node
         self._client = client
+        self._retire = retire
+        self._closed = False
         self._rcl = rcl
         self._signals = signals
         self._signal = signals.join(self)
@@ -193,13 +215,16 @@ class DirectClient:
             self._rcl.signal_responses(self.handle, None)
 
     def close(self) -> None:
-        """Destroy the rcl client; idempotent."""
+        """Stop taking, and have the rcl client destroyed; idempotent."""
+        if self._closed:
+            return
+        self._closed = True
         self._out.clear()
         self.stop_signalling()
         self._signals.leave(self, self._signal)
         if self._poll is not None:
             self._poll.leave(self)
-        self._node.destroy_client(self._client)
+        self._retire(self._client)
 
     def start_signalling(self) -> None:
         """Have responses wake the loop, those that have come already too."""
@@ -210,6 +235,8 @@ class DirectClient:
 
 class DirectService:
     """A rcl service that the loop's thread takes from."""
+
+    linger = LINGER
 
     def __init__(
         self,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import itertools
 import weakref
 from collections.abc import Callable
@@ -27,6 +28,7 @@ class ExecutorBridge:
     """Has the executor take responses and requests, and brings them to the loop by a mailbox."""
 
     name = "executor"
+    linger = 0.0
 
     def __init__(self, node: Node, mailbox: Mailbox, configure: Callable[[Any], None]) -> None:
         self._node = node
@@ -77,7 +79,7 @@ class FutureClient:
         number = next(self._numbers)
         future = self._client.call_async(request)
         self._out[number] = future
-        future.add_done_callback(_Completion(self, number))
+        future.add_done_callback(functools.partial(self._complete, number))
         return number
 
     def forget(self, number: int) -> None:
@@ -92,7 +94,7 @@ class FutureClient:
             self.forget(number)
         self._node.destroy_client(self._client)
 
-    def complete(self, number: int, future: Any) -> None:
+    def _complete(self, number: int, future: Any) -> None:
         """Take a completed future's response to the loop. Called on the executor's thread."""
         if not future.cancelled():
             # After the close there is nobody to be told.
@@ -104,19 +106,6 @@ class FutureClient:
             self._deliver(number, future.result())
 
 
-class _Completion:
-    """The done-callback of one request."""
-
-    __slots__ = ("_client", "_number")
-
-    def __init__(self, client: FutureClient, number: int) -> None:
-        self._client = client
-        self._number = number
-
-    def __call__(self, future: Any) -> None:
-        self._client.complete(self._number, future)
-
-
 class FutureService:
     """A rclpy service whose requests the executor takes, and whose responses are ours to send.
 
@@ -125,6 +114,8 @@ class FutureService:
     ``send_response``, replaced on this one service, takes it and its header to the loop. The
     executor goes on at once, whenever the response will be sent.
     """
+
+    linger = 0.0
 
     def __init__(self, node: Node, mailbox: Mailbox, deliver: DeliverRequest) -> None:
         self._node = node

@@ -217,9 +217,11 @@ class RosNode:
         return self._thread is None or self._thread.join(JOIN)
 
     async def stopped(self) -> None:
-        """Wait, after `stop`, until `join` has nothing to wait for."""
+        """Wait, after `stop`, until `join` has nothing to wait for, and `close` destroys safely."""
         if self._thread is not None:
             await self._thread_ended.wait()
+        if self._bridge is not None:
+            await asyncio.sleep(self._bridge.linger)
 
     def close(self) -> None:
         """Give back what was borrowed and destroy what is owned; after `stop` and `join`."""

@@ -70,6 +70,10 @@ class ServicePort(Protocol):
     def qos(self) -> Any:
         """The QoS in use."""
 
+    @property
+    def linger(self) -> float:
+        """Seconds to wait between `stop` and `close`, if there is time."""
+
     def send(self, header: RequestHeader, response: Any) -> None:
         """Convert and send a response. On any thread, but never during or after `close`.
 
