@@ -30,127 +30,38 @@ Pin = Annotated[
 ]
 Chosen = Annotated[str, typer.Option("--contestants", help="Only these: a,b,c.")]
 
+SUITE_COMMANDS = {
+    "latency": "Time of a call, calls at once, idle clients, idle CPU and memory.",
+    "throughput": "Calls per second of 1, 8, 64 and 512 callers.",
+    "scale": "Many services, idle clients, large responses and slow servers.",
+    "hosts": "A server on another host, a network namespace; needs root.",
+    "targets": "The least of everything that shows whether the targets are reached.",
+    "ticks": "Ticks of behaviour trees: what they cost, and how soon they send and see.",
+    "flood": "Calls lost by a busy client while another process floods its server.",
+    "servers": "A rosasync server beside a stock one, driven by the same client.",
+    "idle": "CPU of a client that calls nothing.",
+    "memory": "Memory after 100,000 calls, above that after 10,000.",
+}
+
 app = typer.Typer(help=__doc__, no_args_is_help=True, pretty_exceptions_enable=False)
 
 
-@app.command()
-def latency(
-    quick: Quick = False,
-    rounds: Rounds = None,
-    json: Json = None,
-    contestants: Chosen = "",
-    pin: Pin = None,
-) -> None:
-    """Time of a call, calls at once, idle clients, idle CPU and memory."""
-    measure(["latency"], quick, rounds, json, contestants, pin)
+def add_command(suite: str, text: str) -> None:
+    """Add a command that measures one suite."""
+
+    @app.command(suite, help=text)
+    def command(
+        quick: Quick = False,
+        rounds: Rounds = None,
+        json: Json = None,
+        contestants: Chosen = "",
+        pin: Pin = None,
+    ) -> None:
+        measure([suite], quick, rounds, json, contestants, pin)
 
 
-@app.command()
-def throughput(
-    quick: Quick = False,
-    rounds: Rounds = None,
-    json: Json = None,
-    contestants: Chosen = "",
-    pin: Pin = None,
-) -> None:
-    """Calls per second of 1, 8, 64 and 512 callers."""
-    measure(["throughput"], quick, rounds, json, contestants, pin)
-
-
-@app.command()
-def scale(
-    quick: Quick = False,
-    rounds: Rounds = None,
-    json: Json = None,
-    contestants: Chosen = "",
-    pin: Pin = None,
-) -> None:
-    """Many services, idle clients, large responses and slow servers."""
-    measure(["scale"], quick, rounds, json, contestants, pin)
-
-
-@app.command()
-def hosts(
-    quick: Quick = False,
-    rounds: Rounds = None,
-    json: Json = None,
-    contestants: Chosen = "",
-    pin: Pin = None,
-) -> None:
-    """A server on another host, a network namespace; needs root."""
-    measure(["hosts"], quick, rounds, json, contestants, pin)
-
-
-@app.command()
-def targets(
-    quick: Quick = False,
-    rounds: Rounds = None,
-    json: Json = None,
-    contestants: Chosen = "",
-    pin: Pin = None,
-) -> None:
-    """The least of everything that shows whether the targets are reached."""
-    measure(["targets"], quick, rounds, json, contestants, pin)
-
-
-@app.command()
-def ticks(
-    quick: Quick = False,
-    rounds: Rounds = None,
-    json: Json = None,
-    contestants: Chosen = "",
-    pin: Pin = None,
-) -> None:
-    """Ticks of behaviour trees: what they cost, and how soon they send and see."""
-    measure(["ticks"], quick, rounds, json, contestants, pin)
-
-
-@app.command()
-def flood(
-    quick: Quick = False,
-    rounds: Rounds = None,
-    json: Json = None,
-    contestants: Chosen = "",
-    pin: Pin = None,
-) -> None:
-    """Calls lost by a busy client while another process floods its server."""
-    measure(["flood"], quick, rounds, json, contestants, pin)
-
-
-@app.command()
-def servers(
-    quick: Quick = False,
-    rounds: Rounds = None,
-    json: Json = None,
-    contestants: Chosen = "",
-    pin: Pin = None,
-) -> None:
-    """A rosasync server beside a stock one, driven by the same client."""
-    measure(["servers"], quick, rounds, json, contestants, pin)
-
-
-@app.command()
-def idle(
-    quick: Quick = False,
-    rounds: Rounds = None,
-    json: Json = None,
-    contestants: Chosen = "",
-    pin: Pin = None,
-) -> None:
-    """CPU of a client that calls nothing."""
-    measure(["idle"], quick, rounds, json, contestants, pin)
-
-
-@app.command()
-def memory(
-    quick: Quick = False,
-    rounds: Rounds = None,
-    json: Json = None,
-    contestants: Chosen = "",
-    pin: Pin = None,
-) -> None:
-    """Memory after 100,000 calls, above that after 10,000."""
-    measure(["memory"], quick, rounds, json, contestants, pin)
+for _suite, _text in SUITE_COMMANDS.items():
+    add_command(_suite, _text)
 
 
 @app.command()
