@@ -131,6 +131,11 @@ class _Runner:
             raise result
         return asdict(result)
 
+    def stop(self) -> None:
+        """End the work, and an endless run that is under way."""
+        self._enough.set()
+        self.runs.put(None)
+
     def work(self) -> None:
         while (run := self.runs.get()) is not None:
             try:
@@ -271,7 +276,7 @@ def main() -> None:
 
     def read() -> None:
         serve_commands({"start": runner.start, "result": runner.result})
-        runner.runs.put(None)
+        runner.stop()
 
     reader = threading.Thread(target=read)
     reader.start()
