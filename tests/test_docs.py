@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.servers import serving
+
 EXAMPLES = Path(__file__).parent.parent / "docs" / "examples"
 
 PRINTS = {
@@ -23,10 +25,8 @@ PRINTS = {
 
 @pytest.fixture(scope="module")
 def lamp() -> Iterator[None]:
-    command = (sys.executable, str(EXAMPLES / "lamp.py"))
-    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as server:
+    with serving(EXAMPLES / "lamp.py"):
         yield
-        server.terminate()
 
 
 def output_of(example: str) -> str:

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.servers import serving
+
 ROBOT = Path(__file__).parent.parent / "docs" / "examples" / "robot"
 
 TREES = (
@@ -32,10 +34,8 @@ LAST = ["the map is saved", "success"]
 
 @pytest.fixture(scope="module")
 def robot() -> Iterator[None]:
-    command = (sys.executable, str(ROBOT / "robot.py"))
-    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as server:
+    with serving(ROBOT / "robot.py"):
         yield
-        server.terminate()
 
 
 @pytest.mark.usefixtures("robot")
