@@ -1,4 +1,4 @@
-"""One client: sequence number → asyncio future."""
+"""One client, and the calls it carries: sequence number → call → asyncio future."""
 
 from __future__ import annotations
 
@@ -7,13 +7,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from rosasync.deadlines import Deadlines
 from rosasync.limits import Limits, Retry
 
 if TYPE_CHECKING:
     from rosasync.ros.ports import ClientPort, Deliver
 
-__all__ = ["Client", "Counts"]
+__all__ = ["Call", "Client", "Counts"]
+
+NOT_SENT = 0
+"""Is no sequence number: those of rcl begin with 1."""
 
 
 @dataclass(slots=True)
@@ -31,22 +33,86 @@ class Counts:
     retried: int = 0
 
 
+class Call:
+    """One request: in line for a client, sent with it, answered or given up.
+
+    Confined to the loop's thread. From `start` to `end` it holds a place in the client's window;
+    with a client that its caller leases (``leased``), the lease holds it.
+    """
+
+    __slots__ = (
+        "_leased",
+        "_resend",
+        "_retry",
+        "_sequence_number",
+        "client",
+        "future",
+        "out",
+        "request",
+        "started",
+    )
+
+    client: Client
+    _resend: _Resend
+    _sequence_number: int
+
+    def __init__(
+        self, future: asyncio.Future[Any], request: Any, retry: Retry | None, leased: bool = False
+    ) -> None:
+        self.future = future
+        self.request = request
+        self.started = False
+        self.out = False
+        self._leased = leased
+        self._retry = retry
+
+    def start(self, client: Client) -> None:
+        """Send the request; where that fails, the future is told."""
+        self.client = client
+        self.started = self.out = True
+        counts = client.counts
+        counts.in_flight += 1
+        if counts.in_flight > counts.peak:
+            counts.peak = counts.in_flight
+        try:
+            sequence_number = client.send(self.request)
+        except Exception as error:
+            self._retry = None
+            self._sequence_number = NOT_SENT
+            self.future.set_exception(error)
+            return
+        client.unanswered[sequence_number] = self
+        self._sequence_number = sequence_number
+        if self._retry is not None:
+            self._resend = _Resend(self, client, self._retry, sequence_number)
+
+    def end(self) -> None:
+        """Give the place back: the response is there, or nobody waits for it any more."""
+        self.out = False
+        client = self.client
+        client.counts.in_flight -= 1
+        if self._retry is not None:
+            self._resend.end()
+        elif client.unanswered.pop(self._sequence_number, None) is not None:
+            client.abandon(self._sequence_number)
+        if not self._leased:
+            client.leases -= 1
+            client.on_room()
+
+
 class Client:
     """A rcl client and the requests it carries. Confined to the loop's thread.
 
-    ``leases`` counts those who may send; an abandoned request (nobody waits for it any more, but
-    it is still in the server's queue) holds a place like a lease, until its late response arrives
-    or the grace period is over. ``graph`` is the pool's: at which state of the ROS graph a server
-    was last seen matched.
+    ``unanswered`` are the calls that are out, by sequence number. ``leases`` counts those who may
+    send; an abandoned request (nobody waits for it any more, but it is still in the server's queue)
+    holds a place like a lease, until its late response arrives or the grace period is over.
+    ``graph`` is the pool's: at which state of the ROS graph a server was last seen matched.
     """
 
     __slots__ = (
         "_abandoned",
-        "_deadlines",
         "_grace_timer",
         "_loop",
-        "_on_room",
-        "_pending",
         "_port",
         "_window",
         "closed",
@@ -55,6 +121,9 @@ class Client:
         "graph",
         "idle_since",
         "leases",
+        "on_room",
+        "send",
+        "unanswered",
     )
 
     def __init__(
@@ -63,14 +132,12 @@ class Client:
         limits: Limits,
         counts: Counts,
         on_room: Callable[[], None],
-        deadlines: Deadlines,
     ) -> None:
         self._loop = asyncio.get_running_loop()
         self._window = limits.in_flight
         self.grace = limits.grace
-        self._on_room = on_room
-        self._deadlines = deadlines
-        self._pending: dict[int, asyncio.Future[Any]] = {}
+        self.on_room = on_room
+        self.unanswered: dict[int, Call] = {}
         self._abandoned: dict[int, float] = {}
         self._grace_timer: asyncio.TimerHandle | None = None
         self.counts = counts
@@ -79,6 +146,7 @@ class Client:
         self.idle_since = self._loop.time()
         self.closed = False
         self._port = open_port(self._deliver)
+        self.send = self._port.send
 
     def __repr__(self) -> str:
         state = "closed" if self.closed else "idle" if self.is_idle else "in use"
@@ -103,57 +171,17 @@ class Client:
         """Tell whether a server is matched."""
         return self._port.ready()
 
-    async def call(
-        self, request: Any, deadline: float | None = None, retry: Retry | None = None
-    ) -> Any:
-        """Send a request and wait for the response.
-
-        Args:
-            request: a message of the service's request type.
-            deadline: in the loop's time, or None.
-            retry: when to send again.
-
-        Raises:
-            Expired: the deadline passed.
-            Exception: what `fail` was given while the request was out.
-        """
-        future: asyncio.Future[Any] = self._loop.create_future()
-        pending = self._pending
-        sequence_number = self._port.send(request)
-        pending[sequence_number] = future
-        counts = self.counts
-        counts.in_flight += 1
-        if counts.in_flight > counts.peak:
-            counts.peak = counts.in_flight
-        entry = None if deadline is None else self._deadlines.set(future, deadline)
-        resend = None if retry is None else _Resend(self, request, future, retry, sequence_number)
-        try:
-            return await future
-        except asyncio.CancelledError:
-            # Answered, but its task was cancelled before it woke up.
-            if not future.cancelled() and future.exception() is None:
-                counts.late += 1
-            raise
-        finally:
-            counts.in_flight -= 1
-            if entry is not None:
-                self._deadlines.met(entry)
-            if resend is not None:
-                resend.end()
-            elif pending.pop(sequence_number, None) is not None:
-                self._abandon(sequence_number)
-
     def fail(self, error: Callable[[], Exception]) -> None:
         """End every call that is out with an error, and forget what was abandoned."""
-        for future in self._pending.values():
-            if not future.done():
-                future.set_exception(error())
-        for sequence_number in (*self._pending, *self._abandoned):
+        for call in self.unanswered.values():
+            if not call.future.done():
+                call.future.set_exception(error())
+        for sequence_number in (*self.unanswered, *self._abandoned):
             self._port.forget(sequence_number)
-        self._pending.clear()
+        self.unanswered.clear()
         if self._abandoned:
             self._abandoned.clear()
-            self._on_room()
+            self.on_room()
 
     def close(self) -> None:
         """Destroy the rcl client; idempotent. What is still out never ends: `fail` it first."""
@@ -166,29 +194,24 @@ class Client:
         self._port.close()
 
     def _deliver(self, sequence_number: int, response: Any) -> None:
-        future = self._pending.pop(sequence_number, None)
-        if future is not None and not future.done():
-            future.set_result(response)
+        call = self.unanswered.pop(sequence_number, None)
+        if call is not None:
+            if call.future.done():
+                self.counts.late += 1
+            else:
+                call.future.set_result(response)
+            call.end()
             return
         self.counts.late += 1
         if self._abandoned.pop(sequence_number, None) is not None:
-            self._on_room()
+            self.on_room()
 
-    def _send_again(self, request: Any, future: asyncio.Future[Any]) -> int:
-        sequence_number = self._port.send(request)
-        self._pending[sequence_number] = future
-        self.counts.retried += 1
-        return sequence_number
+    def outrun(self, sequence_number: int) -> None:
+        """Expect no response to a request that has left the server's queue, after a while."""
+        self._loop.call_later(self.grace, self._port.forget, sequence_number)
 
-    def _withdraw(self, sequence_number: int, *, still_queued: bool) -> None:
-        if self._pending.pop(sequence_number, None) is None:
-            return
-        if still_queued:
-            self._abandon(sequence_number)
-        else:
-            self._loop.call_later(self.grace, self._port.forget, sequence_number)
-
-    def _abandon(self, sequence_number: int) -> None:
+    def abandon(self, sequence_number: int) -> None:
+        """Let a request hold a place of its own that may still be in the server's queue."""
         if self.closed:
             return
         ends = self._loop.time() + self.grace
@@ -206,25 +229,17 @@ class Client:
                 break
             del self._abandoned[sequence_number]
             self._port.forget(sequence_number)
-        self._on_room()
+        self.on_room()
 
 
 class _Resend:
     """Sends one request again while it is unanswered."""
 
-    __slots__ = ("_client", "_future", "_request", "_retry", "_sent", "_timer", "_wait")
+    __slots__ = ("_call", "_client", "_retry", "_sent", "_timer", "_wait")
 
-    def __init__(
-        self,
-        client: Client,
-        request: Any,
-        future: asyncio.Future[Any],
-        retry: Retry,
-        sequence_number: int,
-    ) -> None:
+    def __init__(self, call: Call, client: Client, retry: Retry, sequence_number: int) -> None:
+        self._call = call
         self._client = client
-        self._request = request
-        self._future = future
         self._retry = retry
         self._sent = [sequence_number]
         self._wait = retry.after
@@ -233,17 +248,21 @@ class _Resend:
 
     def _arm(self) -> None:
         if len(self._sent) < self._retry.attempts:
-            self._timer = self._future.get_loop().call_later(self._wait, self._fire)
+            self._timer = self._call.future.get_loop().call_later(self._wait, self._fire)
             self._wait *= self._retry.backoff
 
     def _fire(self) -> None:
-        if self._future.done():
+        future = self._call.future
+        if future.done():
             return
         try:
-            self._sent.append(self._client._send_again(self._request, self._future))
+            sequence_number = self._client.send(self._call.request)
         except Exception as error:
-            self._future.set_exception(error)
+            future.set_exception(error)
             return
+        self._client.unanswered[sequence_number] = self._call
+        self._sent.append(sequence_number)
+        self._client.counts.retried += 1
         self._arm()
 
     def end(self) -> None:
@@ -254,6 +273,12 @@ class _Resend:
         """
         if self._timer is not None:
             self._timer.cancel()
-        answered = max((n for n in self._sent if n not in self._client._pending), default=-1)
+        client = self._client
+        answered = max((n for n in self._sent if n not in client.unanswered), default=-1)
         for sequence_number in self._sent:
-            self._client._withdraw(sequence_number, still_queued=sequence_number > answered)
+            if client.unanswered.pop(sequence_number, None) is None:
+                continue
+            if sequence_number > answered:
+                client.abandon(sequence_number)
+            else:
+                client.outrun(sequence_number)

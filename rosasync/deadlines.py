@@ -14,7 +14,7 @@ SPARE = 64
 """Deadlines that were met and may stay in the heap, beside as many as there are others."""
 
 Entry = list[Any]
-"""A deadline, a number that no other has, and the future, or None when it is met."""
+"""A deadline, a number that no other has, and the future; put None there when it is met."""
 
 
 class Expired(Exception):
@@ -38,7 +38,7 @@ class Deadlines:
         self._first = math.inf
 
     def set(self, future: asyncio.Future[Any], deadline: float) -> Entry:
-        """Fail a future at a time of the loop's, unless it is done or the deadline is met."""
+        """Fail a future at a time of the loop's, unless it is done, or gone from the entry."""
         entry: Entry = [deadline, next(self._numbers), future]
         heap = self._heap
         heappush(heap, entry)
@@ -47,10 +47,6 @@ class Deadlines:
         if deadline < self._first:
             self._arm(deadline)
         return entry
-
-    def met(self, entry: Entry) -> None:
-        """Forget a future."""
-        entry[-1] = None
 
     def close(self) -> None:
         """Forget every future; idempotent."""

@@ -11,7 +11,7 @@ from contextlib import asynccontextmanager, suppress
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from rosasync.client import Client, Counts
+from rosasync.client import Call, Client, Counts
 from rosasync.deadlines import Deadlines, Expired
 from rosasync.errors import (
     CallError,
@@ -83,7 +83,7 @@ class Endpoint:
         self.srv_name = srv_name
         self.qos = qos
         self.clients: list[Client] = []
-        self.waiters: OrderedDict[asyncio.Future[Client], None] = OrderedDict()
+        self.waiters: OrderedDict[asyncio.Future[Any], Callable[[Client], None]] = OrderedDict()
         self.watchers: dict[asyncio.Future[None], None] = {}
         self.turns: dict[asyncio.Future[None], Client] = {}
         self.counts = Counts()
@@ -197,7 +197,7 @@ class ClientPool:
             yield leased
         finally:
             leased.closed = True
-            self._release(endpoint, client)
+            self._release(client)
 
     async def warm(self, srv_type: Any, srv_name: str, clients: int = 1) -> None:
         """Make clients ahead of the first call, and match them with the server if there is one.
@@ -272,20 +272,37 @@ class ClientPool:
         timeout: float | None,
         wait: bool = True,
         retry: Retry | None = None,
+        leased: Client | None = None,
     ) -> Any:
-        """Lease a client, call, and take it back."""
-        started = self._loop.time()
+        """Call with the first client that has room, or with the one that the caller leases."""
+        loop = self._loop
+        started = loop.time()
         deadline = None if timeout is None else started + timeout
+        call = Call(loop.create_future(), request, retry, leased is not None)
+        entry = None
         try:
-            client = self._lease_any(endpoint)
-            if client is None:
-                client = await self._reach(endpoint, started, deadline, wait)
-            try:
-                response = await client.call(request, deadline, retry)
-            finally:
-                self._release(endpoint, client)
+            if leased is not None:
+                self.check_open()
+                await self._take_turn(endpoint, leased, deadline)
+                call.start(leased)
+            elif (client := self._lease_any(endpoint)) is not None:
+                call.start(client)
+            else:
+                if not wait:
+                    await self._check_server(endpoint, started, deadline)
+                self._join_line(endpoint, call.future, call.start)
+            if deadline is not None:
+                entry = self._deadlines.set(call.future, deadline)
+            response = await call.future
         except BaseException as error:
-            raise self._account(endpoint, error, started) from None
+            raise self._account(endpoint, call, error, started) from None
+        finally:
+            if entry is not None:
+                entry[-1] = None
+            if call.out:
+                call.end()
+            elif not call.started:
+                self._leave_line(endpoint, call.future)
         endpoint.counts.completed += 1
         return response
 
@@ -351,31 +368,6 @@ class ClientPool:
             endpoint.clients.clear()
         self._shortcuts.clear()
 
-    async def call_leased(
-        self,
-        endpoint: Endpoint,
-        client: Client,
-        request: Any,
-        timeout: Timeout,
-        retry: Retry | None,
-    ) -> Any:
-        """Call with a client that the caller leases."""
-        message = self.request(endpoint, request)
-        seconds = check_timeout(timeout, self._timeout)
-        started = self._loop.time()
-        deadline = None if seconds is None else started + seconds
-        try:
-            self.check_open()
-            try:
-                await self._take_turn(endpoint, client, deadline)
-            except Expired:
-                raise self._unreached(endpoint, started) from None
-            response = await client.call(message, deadline, retry)
-        except BaseException as error:
-            raise self._account(endpoint, error, started) from None
-        endpoint.counts.completed += 1
-        return response
-
     # Who gets a client.
 
     def _lease_any(self, endpoint: Endpoint) -> Client | None:
@@ -409,10 +401,10 @@ class ClientPool:
                 return len(endpoint.clients) < self._limits.clients and coming < len(
                     endpoint.waiters
                 )
-            waiter, _ = endpoint.waiters.popitem(last=False)
+            waiter, go_on = endpoint.waiters.popitem(last=False)
             if not waiter.done():
                 client.leases += 1
-                waiter.set_result(client)
+                go_on(client)
         return False
 
     def _serve_line(self, endpoint: Endpoint) -> None:
@@ -422,27 +414,43 @@ class ClientPool:
         while self._assign(endpoint):
             self._open(endpoint)
 
+    def _join_line(
+        self, endpoint: Endpoint, waiter: asyncio.Future[Any], go_on: Callable[[Client], None]
+    ) -> None:
+        """Stand in line for a client; ``go_on`` is called with it, unless the waiter is done then.
+
+        Raises:
+            PoolFull: the line is as long as allowed.
+        """
+        self.check_open()
+        endpoint.waiters[waiter] = go_on
+        self._serve_line(endpoint)
+        if waiter in endpoint.waiters:
+            self._check_line(endpoint)
+            if self._awaits_match(endpoint):
+                self._look_soon()
+
+    def _leave_line(self, endpoint: Endpoint, waiter: asyncio.Future[Any]) -> None:
+        endpoint.waiters.pop(waiter, None)
+        self._evict_later()
+
     async def _queue(self, endpoint: Endpoint, deadline: float | None) -> Client:
-        """Stand in line for a client.
+        """Wait in line for a client.
 
         Raises:
             Expired: the deadline passed.
             PoolFull: the line is as long as allowed.
         """
-        self.check_open()
         waiter: asyncio.Future[Client] = self._loop.create_future()
-        endpoint.waiters[waiter] = None
         try:
-            self._serve_line(endpoint)
-            if not waiter.done():
-                self._check_line(endpoint)
+            self._join_line(endpoint, waiter, waiter.set_result)
             return await self._wait(endpoint, waiter, deadline)
         except BaseException:
             if waiter.done() and not waiter.cancelled() and waiter.exception() is None:
-                self._release(endpoint, waiter.result())
+                self._release(waiter.result())
             raise
         finally:
-            endpoint.waiters.pop(waiter, None)
+            self._leave_line(endpoint, waiter)
 
     def _check_line(self, endpoint: Endpoint) -> None:
         """Raise `PoolFull` where the line is too long, with the one who has just joined it.
@@ -456,25 +464,20 @@ class ClientPool:
                 f"client, Limits.waiting={self._limits.waiting} allows no more"
             )
 
-    async def _reach(
-        self, endpoint: Endpoint, started: float, deadline: float | None, wait: bool
-    ) -> Client:
-        """Wait for a client that is matched with a server.
+    async def _check_server(
+        self, endpoint: Endpoint, started: float, deadline: float | None
+    ) -> None:
+        """Wait for a match with a server that the graph shows, for a moment at the most.
 
         Raises:
-            ServiceUnavailable: there is no server, and ``wait`` is False or the deadline passed.
-            QueueTimeout: there is one, but no client became free.
+            ServiceUnavailable: the graph shows none, or none was matched.
         """
-        self.check_open()
-        if not wait and not self.is_ready(endpoint):
-            if not self._provided(endpoint):
-                raise self._unavailable(endpoint, self._loop.time() - started)
-            left = math.inf if deadline is None else max(0.0, deadline - self._loop.time())
-            await self.wait_for_server(endpoint, min(MATCHING, left))
-        try:
-            return await self._queue(endpoint, deadline)
-        except Expired:
-            raise self._unreached(endpoint, started) from None
+        if self.is_ready(endpoint):
+            return
+        if not self._provided(endpoint):
+            raise self._unavailable(endpoint, self._loop.time() - started)
+        left = math.inf if deadline is None else max(0.0, deadline - self._loop.time())
+        await self.wait_for_server(endpoint, min(MATCHING, left))
 
     async def _take_turn(self, endpoint: Endpoint, client: Client, deadline: float | None) -> None:
         """Wait until a leased client is matched, and abandoned requests leave it a place.
@@ -504,17 +507,12 @@ class ClientPool:
             return await future
         finally:
             if entry is not None:
-                self._deadlines.met(entry)
+                entry[-1] = None
             self._evict_later()
 
-    def _release(self, endpoint: Endpoint, client: Client) -> None:
+    def _release(self, client: Client) -> None:
         client.leases -= 1
-        if self._ending is not None:
-            return
-        if endpoint.waiters:
-            self._serve_line(endpoint)
-        client.idle_since = self._loop.time()
-        self._evict_later()
+        client.on_room()
 
     # Making and destroying clients.
 
@@ -522,8 +520,12 @@ class ClientPool:
         self.check_open()
 
         def on_room() -> None:
-            client.idle_since = self._loop.time()
-            self._evict_later()
+            if self._ending is not None:
+                return
+            if not client.leases:
+                client.idle_since = self._loop.time()
+            if self._evict_timer is None:
+                self._evict_later()
             if endpoint.waiters or endpoint.turns:
                 self._serve_line(endpoint)
 
@@ -534,7 +536,6 @@ class ClientPool:
             self._limits,
             endpoint.counts,
             on_room,
-            self._deadlines,
         )
         endpoint.clients.append(client)
         endpoint.counts.created += 1
@@ -666,11 +667,15 @@ class ClientPool:
         )
         return endpoint.error(QueueTimeout, message, elapsed)
 
-    def _account(self, endpoint: Endpoint, error: BaseException, started: float) -> BaseException:
+    def _account(
+        self, endpoint: Endpoint, call: Call, error: BaseException, started: float
+    ) -> BaseException:
         """Count how a call failed, and say it in the caller's terms."""
         counts = endpoint.counts
         elapsed = self._loop.time() - started
-        if isinstance(error, Expired):
+        if isinstance(error, Expired) and not call.started:
+            error = self._unreached(endpoint, started) if self._ending is None else self._ending()
+        elif isinstance(error, Expired):
             message = f"sent, and not answered within {elapsed:.3g} s"
             error = endpoint.error(ResponseTimeout, message, elapsed)
         elif isinstance(error, _Gone):
@@ -680,6 +685,8 @@ class ClientPool:
             error = self._ending() if self._ending is not None else context_shut_down()
         if isinstance(error, asyncio.CancelledError):
             counts.cancelled += 1
+            if call.started and not call.future.cancelled() and call.future.exception() is None:
+                counts.late += 1  # Answered, but its task was cancelled before it woke up.
         elif isinstance(error, TimeoutError):
             counts.timed_out += 1
             logger.debug("%s", error)
@@ -718,9 +725,10 @@ class LeasedClient:
             raise UsageError(f"{self._endpoint.key.srv_name}: the lease {state}")
         self._busy = True
         try:
-            return await self._pool.call_leased(
-                self._endpoint, self._client, request, timeout, retry
-            )
+            pool, endpoint = self._pool, self._endpoint
+            message = pool.request(endpoint, request)
+            seconds = check_timeout(timeout, pool._timeout)
+            return await pool.call(endpoint, message, seconds, retry=retry, leased=self._client)
         finally:
             self._busy = False
 

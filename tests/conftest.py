@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import importlib
 import logging
+import signal
 import threading
 import warnings
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
@@ -20,6 +21,9 @@ from tests.support.servers import ServerProcess
 from tests.support.times import TICK
 
 isolate()
+
+# A shell that starts this in the background has it ignored, and the children would inherit that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 with warnings.catch_warnings():
     # Of rclpy's own dependencies lark still imports sre_parse, which is deprecated.

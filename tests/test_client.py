@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from rosasync import Limits, Retry
-from rosasync.client import Client, Counts
+from rosasync.client import Call, Client, Counts
 from rosasync.deadlines import Deadlines, Expired
 from rosasync.testing import FakeClient, FakeGraph, FakeNode
 from tests.support.times import TICK, until
@@ -23,7 +23,8 @@ class Rig:
         self.node.attach(lambda: None, lambda: None)
         self.counts = Counts()
         self.room = 0
-        self.client = Client(self._open, Limits(**limits), self.counts, self._on_room, Deadlines())
+        self.client = Client(self._open, Limits(**limits), self.counts, self._on_room)
+        self._deadlines = Deadlines()
 
     def _open(self, deliver: Callable[[int, Any], None]) -> FakeClient:
         self.port = FakeClient(self.node, "", "/echo", deliver)
@@ -33,8 +34,20 @@ class Rig:
     def _on_room(self) -> None:
         self.room += 1
 
-    async def calling(self, request: object = None, **options: Any) -> asyncio.Task[Any]:
-        task = asyncio.create_task(self.client.call(request, **options))
+    async def call(self, deadline: float | None = None, retry: Retry | None = None) -> Any:
+        """Call in the place of a lease that is held elsewhere."""
+        call = Call(asyncio.get_running_loop().create_future(), None, retry, leased=True)
+        call.start(self.client)
+        if deadline is not None:
+            self._deadlines.set(call.future, deadline)
+        try:
+            return await call.future
+        finally:
+            if call.out:
+                call.end()
+
+    async def calling(self, **options: Any) -> asyncio.Task[Any]:
+        task = asyncio.create_task(self.call(**options))
         sent = len(self.port.sent)
         await until(lambda: len(self.port.sent) > sent)
         return task
@@ -54,7 +67,7 @@ async def test_a_passed_deadline_abandons_and_the_late_response_frees() -> None:
     rig = Rig(in_flight=1)
     deadline = asyncio.get_running_loop().time() + TICK
     with pytest.raises(Expired):
-        await rig.client.call(None, deadline)
+        await rig.call(deadline)
     assert (rig.client.abandoned, rig.client.room) == (1, 0)
     assert not rig.client.is_idle
     rig.port.deliver(1, "late")
@@ -88,7 +101,7 @@ async def test_a_send_that_fails_again_ends_the_call() -> None:
     def refuse(request: object) -> int:
         raise RuntimeError("the middleware is gone")
 
-    rig.port.send = refuse  # type: ignore[method-assign]
+    rig.client.send = refuse
     with pytest.raises(RuntimeError, match="gone"):
         await task
     assert rig.counts.in_flight == 0

@@ -153,5 +153,8 @@ def serve_commands(commands: Mapping[str, Callable[..., Any]]) -> None:
             answer = {"value": commands[message["do"]](**message["with"])}
         except Exception:
             answer = {"error": traceback.format_exc()}
-        sys.stdout.write(json.dumps(answer) + "\n")
-        sys.stdout.flush()
+        try:
+            sys.stdout.write(json.dumps(answer) + "\n")
+            sys.stdout.flush()
+        except BrokenPipeError:
+            return

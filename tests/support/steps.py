@@ -32,19 +32,19 @@ class Victim:
         self.struck = False
         self.suspensions = 0
         self._target = suspension
-        self._moment = moment
+        self.moment = moment
         self.task = asyncio.get_running_loop().create_task(_watched(coroutine, self._suspended))
 
     def __repr__(self) -> str:
-        return f"<Victim await {self._target}, {self._moment}>"
+        return f"<Victim await {self._target}, {self.moment}>"
 
     def _suspended(self, awaited: Any) -> None:
         number, self.suspensions = self.suspensions, self.suspensions + 1
         if number != self._target:
             return
-        if self._moment == "as it suspends":
+        if self.moment == "as it suspends":
             self._strike()
-        elif self._moment == "in the next turn" or awaited is None:
+        elif self.moment == "in the next turn" or awaited is None:
             self.task.get_loop().call_soon(self._strike)
         else:
             awaited.add_done_callback(lambda _: self._strike())
