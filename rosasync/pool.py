@@ -423,12 +423,14 @@ class ClientPool:
             PoolFull: the line is as long as allowed.
         """
         self.check_open()
+        first = not endpoint.waiters
         endpoint.waiters[waiter] = go_on
-        self._serve_line(endpoint)
-        if waiter in endpoint.waiters:
-            self._check_line(endpoint)
+        if first or len(endpoint.clients) < self._limits.clients:
+            self._serve_line(endpoint)
             if self._awaits_match(endpoint):
                 self._look_soon()
+        if len(endpoint.waiters) > self._limits.waiting and waiter in endpoint.waiters:
+            self._check_line(endpoint)
 
     def _leave_line(self, endpoint: Endpoint, waiter: asyncio.Future[Any]) -> None:
         endpoint.waiters.pop(waiter, None)
