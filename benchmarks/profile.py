@@ -59,13 +59,11 @@ STAGES = {
     ("read", "counted"): Stage(KERNEL, "reads the eventfd"),
     ("counted", "take"): Stage(OURS, "finds the client that waits"),
     ("take", "taken"): Stage(MIDDLEWARE, "`take_response`: takes and converts the response"),
-    ("taken", "deliver"): Stage(OURS, "finds the future of the sequence number"),
-    ("deliver", "delivered"): Stage(OURS, "completes the future"),
+    ("taken", "deliver"): Stage(OURS, "finds the request that is answered"),
+    ("deliver", "delivered"): Stage(OURS, "completes the future, gives the place back"),
     ("delivered", "again"): Stage(ASYNCIO, "the reader returns, the loop goes round"),
     ("again", "polled"): Stage(KERNEL, "the loop looks for other events"),
-    ("polled", "resumed"): Stage(ASYNCIO, "wakes the task up"),
-    ("resumed", "released"): Stage(OURS, "returns the lease"),
-    ("released", "answer"): Stage(OURS, "counts, returns"),
+    ("polled", "answer"): Stage(ASYNCIO, "wakes the task up, which counts and returns"),
 }
 """By the names of the stamps at both ends, in order."""
 
@@ -237,7 +235,6 @@ def _stamping(session: rosasync.Session, stamps: Stamps) -> Iterator[None]:
     (endpoint,) = pool._endpoints.values()
     port: Any = endpoint.clients[0]._port
     kept = (port.send_request, port._take, port._deliver, os.eventfd_read)
-    pool._release = stamps.around(pool._release, "resumed", "released")
     port.send_request = stamps.around(port.send_request, "send", "sent")
     port._take = stamps.around(port._take, "take", "taken")
     port._deliver = stamps.around(port._deliver, "deliver", "delivered")
@@ -247,7 +244,6 @@ def _stamping(session: rosasync.Session, stamps: Stamps) -> Iterator[None]:
         yield
     finally:
         stamps.on = False
-        del pool._release
         port.send_request, port._take, port._deliver, os.eventfd_read = kept
 
 

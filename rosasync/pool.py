@@ -44,6 +44,9 @@ T = TypeVar("T")
 
 logger = logging.getLogger("rosasync")
 
+GoOn = Callable[[Client], None]
+"""What somebody in line does with the client he is granted."""
+
 FIRST_LOOK = 0.002
 """Seconds until a new client is first looked at; matching it with a server takes milliseconds."""
 LAST_LOOK = 0.25
@@ -64,6 +67,7 @@ class Endpoint:
         "clients",
         "counts",
         "gone",
+        "granted",
         "key",
         "qos",
         "request_type",
@@ -83,7 +87,8 @@ class Endpoint:
         self.srv_name = srv_name
         self.qos = qos
         self.clients: list[Client] = []
-        self.waiters: OrderedDict[asyncio.Future[Any], Callable[[Client], None]] = OrderedDict()
+        self.waiters: OrderedDict[asyncio.Future[Any], GoOn] = OrderedDict()
+        self.granted: list[tuple[asyncio.Future[Any], GoOn, Client]] = []
         self.watchers: dict[asyncio.Future[None], None] = {}
         self.turns: dict[asyncio.Future[None], Client] = {}
         self.counts = Counts()
@@ -99,7 +104,7 @@ class Endpoint:
     @property
     def has_callers(self) -> bool:
         """Whether somebody waits for a server or a place."""
-        return bool(self.waiters or self.watchers or self.turns)
+        return bool(self.waiters or self.granted or self.watchers or self.turns)
 
     @property
     def has_requests(self) -> bool:
@@ -354,6 +359,7 @@ class ClientPool:
         for endpoint in self._endpoints.values():
             callers: tuple[asyncio.Future[Any], ...] = (
                 *endpoint.waiters,
+                *(waiter for waiter, _, _ in endpoint.granted),
                 *endpoint.watchers,
                 *endpoint.turns,
             )
@@ -404,8 +410,32 @@ class ClientPool:
             waiter, go_on = endpoint.waiters.popitem(last=False)
             if not waiter.done():
                 client.leases += 1
-                go_on(client)
+                if not endpoint.granted:
+                    self._loop.call_soon(self._hand_out, endpoint)
+                endpoint.granted.append((waiter, go_on, client))
         return False
+
+    def _hand_out(self, endpoint: Endpoint) -> None:
+        """Let those go on who were granted a client in the turn before, and still wait for it.
+
+        Those whose server vanished meanwhile go back to the head of the line.
+        """
+        granted, endpoint.granted = endpoint.granted, []
+        back = []
+        for grant in granted:
+            waiter, go_on, client = grant
+            if not waiter.done() and self._is_matched(endpoint, client):
+                go_on(client)
+            else:
+                back.append(grant)
+        for waiter, go_on, client in reversed(back):
+            client.leases -= 1
+            if not waiter.done():
+                endpoint.waiters[waiter] = go_on
+                endpoint.waiters.move_to_end(waiter, last=False)
+                self._look_soon()
+        for _, _, client in back:
+            client.on_room()
 
     def _serve_line(self, endpoint: Endpoint) -> None:
         for turn, client in tuple(endpoint.turns.items()):
@@ -414,9 +444,7 @@ class ClientPool:
         while self._assign(endpoint):
             self._open(endpoint)
 
-    def _join_line(
-        self, endpoint: Endpoint, waiter: asyncio.Future[Any], go_on: Callable[[Client], None]
-    ) -> None:
+    def _join_line(self, endpoint: Endpoint, waiter: asyncio.Future[Any], go_on: GoOn) -> None:
         """Stand in line for a client; ``go_on`` is called with it, unless the waiter is done then.
 
         Raises:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import random
+import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from typing import Any
@@ -119,18 +120,70 @@ async def test_first_come_first_served_also_when_waiters_leave(fake_graph: FakeG
 async def test_a_place_granted_to_one_who_is_cancelled_goes_to_the_next(
     fake_graph: FakeGraph,
 ) -> None:
-    fake_graph.serve(Echo, "/echo", echo)
+    server = fake_graph.serve(Echo, "/echo", echo)
     async with opened(fake_graph, Limits(in_flight=1)) as session:
         async with session.pool.lease(Echo, "/echo"):
-            first = asyncio.create_task(ask(session, 1))
-            second = asyncio.create_task(ask(session, 2))
-            await until(lambda: session.pool.statistics().waiting == 2)
+            first, second = await in_line(session, 1, 2)
         # The lease has just been granted to the first, whose task does not know it yet.
         first.cancel()
         assert await second == 2
         with pytest.raises(asyncio.CancelledError):
             await first
+        assert [request.value for request in server.received] == [2]
         assert session.pool.statistics().idle == 1
+
+
+async def test_a_place_granted_to_one_whose_time_is_up_goes_to_the_next(
+    fake_graph: FakeGraph,
+) -> None:
+    server = fake_graph.serve(Echo, "/echo", echo)
+    async with opened(fake_graph, Limits(in_flight=1)) as session:
+        loop = asyncio.get_running_loop()
+        async with session.pool.lease(Echo, "/echo"):
+            late = asyncio.create_task(ask(session, 1, timeout=TICK))
+            (second,) = await in_line(session, 2, waiting=2)
+            # Its deadline passes in the very turn in which it is granted the lease.
+            loop.call_later(TICK / 2, time.sleep, TICK)
+            await asyncio.sleep(TICK / 2)
+        assert await second == 2
+        with pytest.raises(QueueTimeout):
+            await late
+        assert [request.value for request in server.received] == [2]
+
+
+async def test_a_place_granted_as_everything_ends(fake_graph: FakeGraph) -> None:
+    server = fake_graph.serve(Echo, "/echo", echo)
+    async with opened(fake_graph, Limits(in_flight=1)) as session:
+        async with session.pool.lease(Echo, "/echo"):
+            (first,) = await in_line(session, 1)
+        fake_graph.nodes[0].shutdown()
+        with pytest.raises(ContextShutdown):
+            await first
+    assert server.received == []
+
+
+async def test_a_place_granted_as_the_server_goes(fake_graph: FakeGraph) -> None:
+    """Who was granted it waits for the next server, before those behind."""
+    old = fake_graph.serve(Echo, "/echo", echo)
+    async with opened(fake_graph, Limits(in_flight=2)) as session:
+        async with session.pool.lease(Echo, "/echo"), session.pool.lease(Echo, "/echo"):
+            tasks = await in_line(session, 1, 2, 3)
+        old.close()
+        await asyncio.sleep(TICK)
+        assert session.pool.statistics().waiting == 3
+        new = fake_graph.serve(Echo, "/echo", echo)
+        assert await asyncio.gather(*tasks) == [1, 2, 3]
+    assert [request.value for request in new.received] == [1, 2, 3]
+    assert old.received == []
+
+
+async def in_line(
+    session: Session, *values: int, waiting: int | None = None
+) -> list[asyncio.Task[object]]:
+    """Start calls that have to wait for a place, and wait until so many do."""
+    tasks = [asyncio.create_task(ask(session, value)) for value in values]
+    await until(lambda: session.pool.statistics().waiting == (waiting or len(values)))
+    return tasks
 
 
 async def test_an_abandoned_request_holds_its_place_until_its_late_response(

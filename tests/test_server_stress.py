@@ -9,7 +9,7 @@ import random
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
@@ -19,9 +19,6 @@ from tests.support.clients import ClientProcess
 from tests.support.echo import ECHO
 from tests.support.serving import FORMS, ask, echo_of, serving, settled
 from tests.support.times import LIMIT, TICK, until
-
-if TYPE_CHECKING:
-    pass
 
 numbers = itertools.count()
 
@@ -85,7 +82,7 @@ async def test_a_burst_of_stock_clients_is_taken_and_answered(
 ) -> None:
     """What their own queues of ten then lose of the answers is not the server's."""
     async with serving(session, name, "async, request and response") as server:
-        result = await burst(crowd, name, timeout=20 * TICK)
+        result = await burst(crowd, name, timeout=LIMIT / 4)
         assert result["wrong"] == 0
         assert result["answered"] + result["lost"] == CLIENTS * EACH
         await settled(server)

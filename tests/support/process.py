@@ -14,17 +14,50 @@ import subprocess
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from importlib.metadata import version
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import IO, Any, Self
 
 from tests.support.times import LIMIT
 
-__all__ = ["Child", "ChildError", "serve_commands"]
+__all__ = ["Child", "ChildError", "profile", "serve_commands"]
 
 ROOT = Path(__file__).parents[2]
 SHARED_MEMORY = Path("/dev/shm")
+
+
+_PROFILE_VARIABLE = (
+    "FASTRTPS_DEFAULT_PROFILES_FILE"
+    if version("rclpy").startswith("7.")
+    else "FASTDDS_DEFAULT_PROFILES_FILE"
+)
+
+# New sessions come and go with every test. Announcing itself more often than every 3 s, the process
+# is found at once even by one that takes the place of another. Where a packet of the discovery was
+# lost, its usual 0.1 s would not be enough to match a client before its first response is dropped.
+_PROFILE = """<?xml version="1.0" encoding="UTF-8" ?>
+<profiles xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
+  <participant profile_name="child" is_default_profile="true"><rtps><builtin><discovery_config>
+    <leaseDuration><sec>{seconds}</sec></leaseDuration>
+    <leaseAnnouncement><sec>0</sec><nanosec>200000000</nanosec></leaseAnnouncement>
+  </discovery_config></builtin></rtps></participant>
+  <publisher profile_name="service"><qos><reliability>
+    <max_blocking_time><sec>3</sec></max_blocking_time>
+  </reliability></qos></publisher>
+</profiles>
+"""
+
+
+@contextmanager
+def profile(lease: int = 20) -> Iterator[dict[str, str]]:
+    """Write the profile for a process that makes its context meanwhile; yields its variable."""
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "profile.xml"
+        file.write_text(_PROFILE.format(seconds=lease))
+        yield {_PROFILE_VARIABLE: str(file)}
 
 
 class ChildError(Exception):
@@ -35,20 +68,24 @@ class Child:
     """A child process that runs one of the modules beside this one.
 
     It belongs to no loop: it may be made in a fixture of the whole run and used in any test.
+
+    Args:
+        lease: seconds after which the others notice that it was killed, as in the middleware.
     """
 
     module: str
 
-    def __init__(self, *args: str, env: Mapping[str, str] | None = None) -> None:
+    def __init__(self, *args: str, lease: int = 20) -> None:
         self._lock = threading.Lock()
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", self.module, *args],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            cwd=ROOT,
-            env={**os.environ, **(env or {})},
-        )
-        self.ask_now("ready")
+        with profile(lease) as environment:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", self.module, *args],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                cwd=ROOT,
+                env=os.environ | environment,
+            )
+            self.ask_now("ready")
 
     @property
     def pid(self) -> int:

@@ -17,13 +17,11 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Literal, TypeVar
 
 from tests.support.echo import ECHO, fill, response_to, service_class
-from tests.support.process import Child, serve_commands
+from tests.support.process import Child, profile, serve_commands
 from tests.support.times import LIMIT
 
 __all__ = ["Delay", "ServerProcess", "serving"]
@@ -34,43 +32,13 @@ Delay = float | tuple[float, float] | Literal["hold", "never"] | None
 """When a request is answered: at once (None), after so many seconds, after a random time between
 the two, when :meth:`ServerProcess.release` says so, or never."""
 
-_PROFILE_VARIABLE = (
-    "FASTRTPS_DEFAULT_PROFILES_FILE"
-    if version("rclpy").startswith("7.")
-    else "FASTDDS_DEFAULT_PROFILES_FILE"
-)
-
-# New sessions come and go with every test. Announcing itself more often than every 3 s, the process
-# is found at once even by one that takes the place of another. Where a packet of the discovery was
-# lost, its usual 0.1 s would not be enough to match a client before its first response is dropped.
-_PROFILE = """<?xml version="1.0" encoding="UTF-8" ?>
-<profiles xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
-  <participant profile_name="server" is_default_profile="true"><rtps><builtin><discovery_config>
-    <leaseDuration><sec>{seconds}</sec></leaseDuration>
-    <leaseAnnouncement><sec>0</sec><nanosec>200000000</nanosec></leaseAnnouncement>
-  </discovery_config></builtin></rtps></participant>
-  <publisher profile_name="service"><qos><reliability>
-    <max_blocking_time><sec>3</sec></max_blocking_time>
-  </reliability></qos></publisher>
-</profiles>
-"""
-
-
-@contextmanager
-def _profile(lease: int = 20) -> Iterator[dict[str, str]]:
-    """Write the profile for a process that makes its context meanwhile; yields its variable."""
-    with TemporaryDirectory() as folder:
-        file = Path(folder) / "profile.xml"
-        file.write_text(_PROFILE.format(seconds=lease))
-        yield {_PROFILE_VARIABLE: str(file)}
-
 
 @contextmanager
 def serving(program: Path) -> Iterator[None]:
     """Run a program of the documentation, whose stock servers others call meanwhile."""
     command = (sys.executable, str(program))
     with (
-        _profile() as environment,
+        profile() as environment,
         subprocess.Popen(
             command, env=os.environ | environment, stderr=subprocess.DEVNULL
         ) as server,
@@ -80,17 +48,9 @@ def serving(program: Path) -> Iterator[None]:
 
 
 class ServerProcess(Child):
-    """The parent's side of one such process.
-
-    Args:
-        lease: seconds after which the others notice that it was killed, as in the middleware.
-    """
+    """The parent's side of one such process."""
 
     module = "tests.support.servers"
-
-    def __init__(self, *, lease: int = 20) -> None:
-        with _profile(lease) as environment:
-            super().__init__(env=environment)
 
     async def serve(
         self,
