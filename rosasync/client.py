@@ -93,6 +93,7 @@ class Call:
         client.counts.in_flight -= 1
         if self._retry is not None:
             self._resend.end()
+            del self._resend  # which knows this call
         elif client.unanswered.pop(self._sequence_number, None) is not None:
             client.abandon(self._sequence_number)
         if not self._leased:

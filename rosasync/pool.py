@@ -378,7 +378,7 @@ class ClientPool:
 
     def _lease_any(self, endpoint: Endpoint) -> Client | None:
         """Lease a matched client that has room, unless others came first."""
-        if endpoint.waiters:
+        if endpoint.waiters or endpoint.granted:
             return None
         if self._look_timer is None:
             self._keep_looking()

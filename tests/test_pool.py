@@ -133,6 +133,18 @@ async def test_a_place_granted_to_one_who_is_cancelled_goes_to_the_next(
         assert session.pool.statistics().idle == 1
 
 
+async def test_who_comes_while_another_is_granted_a_place_is_sent_after_him(
+    fake_graph: FakeGraph,
+) -> None:
+    server = fake_graph.serve(Echo, "/echo", echo)
+    async with opened(fake_graph, Limits(in_flight=2)) as session:
+        async with session.pool.lease(Echo, "/echo"), session.pool.lease(Echo, "/echo"):
+            (first,) = await in_line(session, 1)
+        assert await ask(session, 2) == 2
+        assert await first == 1
+    assert [request.value for request in server.received] == [1, 2]
+
+
 async def test_a_place_granted_to_one_whose_time_is_up_goes_to_the_next(
     fake_graph: FakeGraph,
 ) -> None:
