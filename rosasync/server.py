@@ -35,7 +35,7 @@ ENDING = 5.0
 """Seconds for handlers to finish when a server is closed."""
 LAST_STEPS = 1.0
 """Seconds for a cancelled handler to end, before it is left behind."""
-RESEND = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
+RESEND = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 1.6, 1.6, 1.6, 1.6)
 """Seconds to wait before each further attempt to send a response to a client that was just made."""
 LATE = 0.1
 """Seconds from which on a response may find its client gone, so that the graph is asked."""

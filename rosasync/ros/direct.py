@@ -13,7 +13,7 @@ from rclpy.node import Node
 from rosasync.ros.busy_poll import BusyPoll
 from rosasync.ros.ports import Deliver, DeliverRequest, RequestHeader
 from rosasync.ros.rcl import Rcl
-from rosasync.ros.services import has_clients, make_service, qos_of, send_response, take_requests
+from rosasync.ros.services import Responder, make_service, qos_of, take_requests
 from rosasync.ros.signals import Signal, Signals
 
 __all__ = ["LINGER", "DirectBridge", "Reserved"]
@@ -256,7 +256,8 @@ class DirectService:
         self._service = service.handle
         self._request_type = service.srv_type.Request
         self._take = self._service.service_take_request
-        self._send = self._service.service_send_response
+        self._responder = Responder(node, service)
+        self.has_clients = self._responder.has_clients
         self._closed = False
         self._stopped = False
         if not rcl.signal_requests(self._service, self._signal.fd):
@@ -265,11 +266,7 @@ class DirectService:
 
     def send(self, header: RequestHeader, response: Any) -> None:
         """Convert and send a response."""
-        send_response(self._send, response, header.request_id)
-
-    def has_clients(self) -> bool:
-        """Tell whether the graph shows a client."""
-        return has_clients(self._node, self._service)
+        self._responder.send(response, header.request_id)
 
     def take(self, most: int) -> None:
         """Take ``most`` times, and only then deliver: the sooner the queue is empty, the better."""

@@ -16,7 +16,7 @@ from rclpy.node import Node
 from rosasync.errors import SessionClosed
 from rosasync.ros.executor import Mailbox
 from rosasync.ros.ports import Deliver, DeliverRequest, RequestHeader
-from rosasync.ros.services import has_clients, make_service, qos_of, send_response
+from rosasync.ros.services import Responder, make_service, qos_of
 
 __all__ = ["ExecutorBridge"]
 
@@ -136,7 +136,8 @@ class FutureService:
         self.qos = qos_of(service)
         self._request_type = srv_type.Request
         self._take = service.handle.service_take_request
-        self._send = service.handle.service_send_response
+        self._responder = Responder(self._node, service)
+        self.has_clients = self._responder.has_clients
         service.send_response = self._taken
         self._group.shut = False
         if self._node.executor is not None:
@@ -144,11 +145,7 @@ class FutureService:
 
     def send(self, header: RequestHeader, response: Any) -> None:
         """Convert and send a response."""
-        send_response(self._send, response, header.request_id)
-
-    def has_clients(self) -> bool:
-        """Tell whether the graph shows a client."""
-        return has_clients(self._node, self.handle.handle)
+        self._responder.send(response, header.request_id)
 
     def stop(self) -> None:
         """Deliver no more requests; idempotent."""

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 from tests.support.echo import ECHO, answer_to, request_of, service_class
@@ -109,39 +109,47 @@ class _Run:
     block: float
     timeout: float
     tag: str
+    enough: threading.Event = field(default_factory=threading.Event)
+    results: queue.SimpleQueue[Tally | Exception] = field(default_factory=queue.SimpleQueue)
 
 
 class _Runner:
     """The child's side: runs one after the other in the main thread."""
 
     def __init__(self, node: Any) -> None:
-        self.runs: queue.SimpleQueue[_Run | None] = queue.SimpleQueue()
-        self._results: queue.SimpleQueue[Tally | Exception] = queue.SimpleQueue()
-        self._enough = threading.Event()
+        self._runs: queue.SimpleQueue[_Run | None] = queue.SimpleQueue()
+        self._last: _Run | None = None
         self._node = node
 
     def start(self, **options: Any) -> None:
-        self._enough.clear()
-        self.runs.put(_Run(**options))
+        """Begin a run; one that a failed test left behind is ended and forgotten."""
+        self._end_last()
+        self._last = _Run(**options)
+        self._runs.put(self._last)
 
     def result(self) -> dict[str, int]:
-        self._enough.set()
-        result = self._results.get(timeout=3 * LIMIT)
+        assert self._last is not None
+        self._end_last()
+        result = self._last.results.get(timeout=3 * LIMIT)
         if isinstance(result, Exception):
             raise result
         return asdict(result)
 
     def stop(self) -> None:
         """End the work, and an endless run that is under way."""
-        self._enough.set()
-        self.runs.put(None)
+        self._end_last()
+        self._runs.put(None)
+
+    def _end_last(self) -> None:
+        if self._last is not None:
+            self._last.enough.set()
 
     def work(self) -> None:
-        while (run := self.runs.get()) is not None:
+        while (run := self._runs.get()) is not None:
             try:
-                self._results.put(self._run(run))
+                run.results.put(self._run(run))
             except Exception as error:
-                self._results.put(error)
+                run.results.put(error)
 
     def _run(self, run: _Run) -> Tally:
         from rclpy.qos import QoSProfile, qos_profile_services_default
@@ -165,7 +173,7 @@ class _Runner:
 
         def next_text() -> str | None:
             nonlocal count
-            if self._enough.is_set() if run.calls is None else count == run.calls:
+            if run.enough.is_set() if run.calls is None else count == run.calls:
                 return None
             count += 1
             return f"{run.tag}-{index}-{count}"

@@ -45,6 +45,11 @@ def serving(program: Path) -> Iterator[None]:
     ):
         yield
         server.terminate()
+        try:
+            server.wait(LIMIT / 4)
+        except subprocess.TimeoutExpired:
+            # The signal handler of rclpy shuts the context down, but not always is its spin woken.
+            server.kill()
 
 
 class ServerProcess(Child):
