@@ -46,6 +46,8 @@ logger = logging.getLogger("rosasync")
 
 GoOn = Callable[[Client], None]
 """What somebody in line does with the client he is granted."""
+Grant = tuple[asyncio.Future[Any], GoOn, Client]
+"""Who was in line, and the client he is to go on with."""
 
 FIRST_LOOK = 0.002
 """Seconds until a new client is first looked at; matching it with a server takes milliseconds."""
@@ -88,7 +90,7 @@ class Endpoint:
         self.qos = qos
         self.clients: list[Client] = []
         self.waiters: OrderedDict[asyncio.Future[Any], GoOn] = OrderedDict()
-        self.granted: list[tuple[asyncio.Future[Any], GoOn, Client]] = []
+        self.granted: list[Grant] = []
         self.watchers: dict[asyncio.Future[None], None] = {}
         self.turns: dict[asyncio.Future[None], Client] = {}
         self.counts = Counts()
@@ -420,14 +422,16 @@ class ClientPool:
 
         Those whose server vanished meanwhile go back to the head of the line.
         """
-        granted, endpoint.granted = endpoint.granted, []
-        back = []
-        for grant in granted:
-            waiter, go_on, client = grant
-            if not waiter.done() and self._is_matched(endpoint, client):
-                go_on(client)
-            else:
-                back.append(grant)
+        going: list[Grant] = []
+        back: list[Grant] = []
+        for grant in endpoint.granted:
+            waiter, _, client = grant
+            goes = not waiter.done() and self._is_matched(endpoint, client)
+            (going if goes else back).append(grant)
+        # Not before: that look may fail where the context is gone, and `end` has to find them.
+        endpoint.granted = []
+        for _, go_on, client in going:
+            go_on(client)
         for waiter, go_on, client in reversed(back):
             client.leases -= 1
             if not waiter.done():
