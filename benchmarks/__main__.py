@@ -46,10 +46,10 @@ SUITE_COMMANDS = {
 app = typer.Typer(help=__doc__, no_args_is_help=True, pretty_exceptions_enable=False)
 
 
-def add_command(suite: str, text: str) -> None:
-    """Add a command that measures one suite."""
+def add_command(name: str, text: str, suites: list[str], *, and_allocations: bool = False) -> None:
+    """Add a command that measures suites."""
 
-    @app.command(suite, help=text)
+    @app.command(name, help=text)
     def command(
         quick: Quick = False,
         rounds: Rounds = None,
@@ -57,11 +57,11 @@ def add_command(suite: str, text: str) -> None:
         contestants: Chosen = "",
         pin: Pin = None,
     ) -> None:
-        measure([suite], quick, rounds, json, contestants, pin)
+        measure(suites, quick, rounds, json, contestants, pin, and_allocations=and_allocations)
 
 
 for _suite, _text in SUITE_COMMANDS.items():
-    add_command(_suite, _text)
+    add_command(_suite, _text, [_suite])
 
 
 @app.command()
@@ -75,17 +75,12 @@ def allocations(quick: Quick = False, rounds: Rounds = None, json: Json = None) 
     finish(results, json)
 
 
-@app.command("all")
-def everything(
-    quick: Quick = False,
-    rounds: Rounds = None,
-    json: Json = None,
-    contestants: Chosen = "",
-    pin: Pin = None,
-) -> None:
-    """Everything there is to measure."""
-    suites = [name for name in SUITES if name != "targets"]
-    measure(suites, quick, rounds, json, contestants, pin, and_allocations=True)
+add_command(
+    "all",
+    "Everything there is to measure.",
+    [name for name in SUITES if name != "targets"],
+    and_allocations=True,
+)
 
 
 @app.command()
