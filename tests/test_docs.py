@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.servers import serving
+from tests.support.servers import running
 
 EXAMPLES = Path(__file__).parent.parent / "docs" / "examples"
 
@@ -25,7 +25,7 @@ PRINTS = {
 
 @pytest.fixture(scope="module")
 def lamp() -> Iterator[None]:
-    with serving(EXAMPLES / "lamp.py"):
+    with running(EXAMPLES / "lamp.py"):
         yield
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.servers import serving
+from tests.support.servers import running
 
 ROBOT = Path(__file__).parent.parent / "docs" / "examples" / "robot"
 
@@ -34,7 +34,7 @@ LAST = ["the map is saved", "success"]
 
 @pytest.fixture(scope="module")
 def robot() -> Iterator[None]:
-    with serving(ROBOT / "robot.py"):
+    with running(ROBOT / "robot.py"):
         yield
 
 

@@ -24,7 +24,7 @@ from tests.support.echo import ECHO, fill, response_to, service_class
 from tests.support.process import Child, profile, serve_commands
 from tests.support.times import LIMIT
 
-__all__ = ["Delay", "ServerProcess", "serving"]
+__all__ = ["Delay", "ServerProcess", "running"]
 
 T = TypeVar("T")
 
@@ -34,7 +34,7 @@ the two, when :meth:`ServerProcess.release` says so, or never."""
 
 
 @contextmanager
-def serving(program: Path) -> Iterator[None]:
+def running(program: Path) -> Iterator[None]:
     """Run a program of the documentation, whose stock servers others call meanwhile."""
     command = (sys.executable, str(program))
     with (
