@@ -510,8 +510,8 @@ class ServiceServer:
     async def _resend(self, call: ServiceCall, response: Any) -> None:
         """Send again what a client that was just made could not get yet.
 
-        Each attempt may block for 0.1 s, and the middleware does not tell whose responses are
-        concerned: so the waits between them grow.
+        An attempt may block for 0.1 s, where the graph does not show that it would be in vain, and
+        the middleware does not tell whose responses are concerned: so the waits are long, later on.
         """
         for delay in RESEND:
             await asyncio.sleep(delay)
