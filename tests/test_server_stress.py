@@ -171,8 +171,9 @@ async def test_the_server_closes_while_four_threads_answer(
         server = session.serve(ECHO, name, answerers.take)
         for process in crowd:
             await join(process, name, answerers.seen, clients=5, timeout=10 * TICK)
-        answered = server.statistics().responded
-        await until(lambda: server.statistics().responded > answered + 1000)
+        # Of what is sent last, as many as are out may be lost with the server's writer.
+        enough = server.statistics().responded + 1000 + 2 * PROCESSES * 5 * EACH
+        await until(lambda: server.statistics().responded > enough)
         await server.aclose()
     statistics = server.statistics()
     assert statistics.taken == statistics.responded + statistics.dropped
