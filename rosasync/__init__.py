@@ -16,20 +16,19 @@ from rosasync.errors import (
     UsageError,
 )
 from rosasync.futures import wrap_future
-from rosasync.limits import (
-    KeyStatistics,
-    Limits,
-    PoolStatistics,
-    Retry,
-    ServerStatistics,
-    ServiceKey,
-    SessionStatistics,
-)
+from rosasync.options import Limits, Retry
 from rosasync.pool import ClientPool, LeasedClient
 from rosasync.portal import Portal
 from rosasync.proxy import AsyncServiceProxy, ProxyState
 from rosasync.server import RequestInfo, ServiceCall, ServiceServer
 from rosasync.session import ServiceClient, Session
+from rosasync.statistics import (
+    KeyStatistics,
+    PoolStatistics,
+    ServerStatistics,
+    ServiceKey,
+    SessionStatistics,
+)
 
 __all__ = [
     "AsyncServiceProxy",

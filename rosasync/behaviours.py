@@ -18,7 +18,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from rosasync.errors import UsageError
-from rosasync.limits import check_timeout
+from rosasync.options import check_timeout
 from rosasync.proxy import AsyncServiceProxy, ProxyState
 
 try:

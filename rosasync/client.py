@@ -7,10 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from rosasync.limits import Limits, Retry
+from rosasync.options import Limits, Retry
 
 if TYPE_CHECKING:
-    from rosasync.ros.ports import ClientPort, Deliver
+    from rosasync.ports import ClientPort, Deliver
 
 __all__ = ["Call", "Client", "Counts"]
 

@@ -11,8 +11,8 @@ from contextlib import asynccontextmanager, suppress
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from rosasync.aio import Deadlines, Expired
 from rosasync.client import Call, Client, Counts
-from rosasync.deadlines import Deadlines, Expired
 from rosasync.errors import (
     CallError,
     ContextShutdown,
@@ -24,19 +24,11 @@ from rosasync.errors import (
     ServiceUnavailable,
     UsageError,
 )
-from rosasync.limits import (
-    KeyStatistics,
-    Limits,
-    PoolStatistics,
-    Retry,
-    ServiceKey,
-    Timeout,
-    check_count,
-    check_timeout,
-)
+from rosasync.options import Limits, Retry, Timeout, check_count, check_timeout
+from rosasync.statistics import KeyStatistics, PoolStatistics, ServiceKey
 
 if TYPE_CHECKING:
-    from rosasync.ros.ports import NodePort
+    from rosasync.ports import NodePort, Service
 
 __all__ = ["ClientPool", "LeasedClient"]
 
@@ -71,9 +63,8 @@ class Endpoint:
         "gone",
         "granted",
         "key",
-        "qos",
         "request_type",
-        "srv_name",
+        "service",
         "srv_type",
         "turns",
         "waiters",
@@ -81,13 +72,11 @@ class Endpoint:
         "watchers",
     )
 
-    def __init__(self, key: ServiceKey, srv_type: Any, srv_name: str, qos: Any) -> None:
-        self.key = key
-        self.srv_type = srv_type
-        self.request_type: type = srv_type.Request
-        # As given: rclpy resolves it, and a remapping must not be applied twice.
-        self.srv_name = srv_name
-        self.qos = qos
+    def __init__(self, service: Service) -> None:
+        self.service = service
+        self.key = service.key
+        self.srv_type = service.srv_type
+        self.request_type: type = service.srv_type.Request
         self.clients: list[Client] = []
         self.waiters: OrderedDict[asyncio.Future[Any], GoOn] = OrderedDict()
         self.granted: list[Grant] = []
@@ -253,11 +242,10 @@ class ClientPool:
             return self._shortcuts[shortcut]
         except (KeyError, TypeError):
             self.check_open()
-        srv_class, type_name, qos_key = self._node.describe(srv_type, qos)
-        key = ServiceKey(self._node.resolve(srv_name), type_name, qos_key)
-        endpoint = self._endpoints.get(key)
+        service = self._node.describe(srv_type, srv_name, qos)
+        endpoint = self._endpoints.get(service.key)
         if endpoint is None:
-            endpoint = self._endpoints[key] = Endpoint(key, srv_class, srv_name, qos)
+            endpoint = self._endpoints[service.key] = Endpoint(service)
         if qos is None:
             self._shortcuts[shortcut] = endpoint
         return endpoint
@@ -270,7 +258,7 @@ class ClientPool:
         """
         if isinstance(request, endpoint.request_type):
             return request
-        return self._node.request(endpoint.srv_type, request)
+        return self._node.make_request(endpoint.srv_type, request)
 
     async def call(
         self,
@@ -564,9 +552,7 @@ class ClientPool:
                 self._serve_line(endpoint)
 
         client = Client(
-            lambda deliver: self._node.open_client(
-                endpoint.srv_type, endpoint.srv_name, endpoint.qos, deliver
-            ),
+            lambda deliver: self._node.open_client(endpoint.service, deliver),
             self._limits,
             endpoint.counts,
             on_room,
@@ -603,7 +589,7 @@ class ClientPool:
         if not client.ready():
             return False
         client.graph = self._graph
-        if not endpoint.warned and (servers := self._node.servers(endpoint.key.srv_name)) > 1:
+        if not endpoint.warned and (servers := len(self._node.find_servers(endpoint.service))) > 1:
             endpoint.warned = True
             logger.warning(
                 "%s: %d servers answer this name; the first response wins and the others are "
@@ -614,7 +600,7 @@ class ClientPool:
         return True
 
     def _provided(self, endpoint: Endpoint) -> bool:
-        return self._node.provides(endpoint.key.srv_type, endpoint.key.srv_name)
+        return bool(self._node.find_servers(endpoint.service))
 
     def _awaits_match(self, endpoint: Endpoint) -> bool:
         """Tell whether somebody waits for a client to be matched, not just for a place."""
@@ -665,13 +651,13 @@ class ClientPool:
             if (
                 endpoint.gone is None
                 and endpoint.has_requests
-                and not self._node.servers(endpoint.key.srv_name)
+                and not self._node.find_servers(endpoint.service)
             ):
                 endpoint.gone = self._loop.call_later(LAST_WORDS, self._server_gone, endpoint)
 
     def _server_gone(self, endpoint: Endpoint) -> None:
         endpoint.gone = None
-        if not self._node.servers(endpoint.key.srv_name):
+        if not self._node.find_servers(endpoint.service):
             self._graph += 1
             for client in endpoint.clients:
                 client.fail(_Gone)
@@ -684,8 +670,8 @@ class ClientPool:
             raise self._ending()
 
     def _unavailable(self, endpoint: Endpoint, elapsed: float) -> CallError:
-        name, type_name, _ = endpoint.key
-        seen = self._node.seen_instead(type_name, name)
+        type_name = endpoint.key.srv_type
+        seen = self._node.explain_missing(endpoint.service)
         message = f"no server for {type_name} after {elapsed:.3g} s; {seen}"
         return endpoint.error(ServiceUnavailable, message, elapsed)
 

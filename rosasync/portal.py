@@ -10,12 +10,13 @@ from collections.abc import Callable
 from concurrent.futures import CancelledError, Future, InvalidStateError
 from typing import TYPE_CHECKING, Any, Protocol
 
-from rosasync.errors import InvalidServiceName, ResponseTimeout, SessionClosed, UsageError
-from rosasync.limits import Retry, Timeout, check_timeout
+from rosasync.errors import ResponseTimeout, SessionClosed, UsageError
+from rosasync.options import Retry, Timeout, check_timeout
 
 if TYPE_CHECKING:
+    from rosasync.gateway import LoopGateway
     from rosasync.pool import ClientPool
-    from rosasync.ros.node import RosNode
+    from rosasync.ports import NodePort
 
 __all__ = ["Portal"]
 
@@ -41,8 +42,11 @@ class Gate:
     may be called from any thread; dicts are changed by single operations, which are atomic.
     """
 
-    def __init__(self, node: RosNode, pool: ClientPool, timeout: float | None) -> None:
+    def __init__(
+        self, node: NodePort, gateway: LoopGateway, pool: ClientPool, timeout: float | None
+    ) -> None:
         self.loop = asyncio.get_running_loop()
+        self._gateway = gateway
         self.pool = pool
         self.timeout = timeout
         self._node = node
@@ -69,7 +73,7 @@ class Gate:
             raise UsageError(
                 "session.from_thread would block the session's own loop: await session.call"
             )
-        if ident == self._node.thread:
+        if ident == self._node.executor_thread:
             raise UsageError(
                 "session.from_thread would block the executor's thread, which runs this callback"
             )
@@ -87,27 +91,20 @@ class Gate:
         if qos is None:
             with contextlib.suppress(KeyError, TypeError):
                 return self._known[srv_type, srv_name]
-        srv_class, _, _ = self._node.describe(srv_type, qos)
-        try:
-            self._node.resolve(srv_name)
-        except (InvalidServiceName, TypeError):
-            raise
-        except Exception:
-            # With its context down the node cannot tell; why it is down, the loop will.
-            if self._node.ok():
-                raise
+        srv_class = self._node.describe(srv_type, srv_name, qos).srv_type
         self._known[srv_type, srv_name] = srv_class
         return srv_class
 
     def names(self, srv_type: Any, srv_name: str, qos: Any) -> tuple[str, str]:
         """Return the type's name and the resolved service name, for an error."""
-        return self._node.describe(srv_type, qos)[1], self._node.resolve(srv_name)
+        key = self._node.describe(srv_type, srv_name, qos).key
+        return key.srv_type, key.srv_name
 
     def request(self, srv_class: Any, request: Any) -> Any:
         """Return a message of the request type; see `ClientPool.request`."""
         if isinstance(request, srv_class.Request):
             return request
-        return self._node.request(srv_class, request)
+        return self._node.make_request(srv_class, request)
 
     def post(self, pending: Pending, callback: Callable[[], object]) -> None:
         """Have ``callback()`` called on the loop's thread, for what is then pending.
@@ -147,7 +144,7 @@ class Gate:
             callback()
             return
         try:
-            self._node.on_other_thread(callback)
+            self._gateway.post(callback)
         except RuntimeError:
             if not self.loop.is_closed():
                 raise

@@ -7,9 +7,9 @@ import enum
 import time
 from typing import TYPE_CHECKING, Any
 
-from rosasync.eager import begin
+from rosasync.aio import begin
 from rosasync.errors import SessionClosed, UsageError
-from rosasync.limits import check_timeout
+from rosasync.options import check_timeout
 
 if TYPE_CHECKING:
     from rosasync.portal import Gate

@@ -16,13 +16,14 @@ from time import monotonic
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self, TypeAlias
 
-from rosasync.endings import until_done
+from rosasync.aio import until_done
 from rosasync.errors import ContextShutdown, SessionClosed, UsageError
-from rosasync.limits import ServerStatistics, check_count, check_timeout
-from rosasync.ros.ports import Undeliverable, Unmatched
+from rosasync.options import check_count, check_timeout
+from rosasync.ports import Undeliverable, Unmatched
+from rosasync.statistics import ServerStatistics
 
 if TYPE_CHECKING:
-    from rosasync.ros.ports import NodePort, RequestHeader, ServicePort
+    from rosasync.ports import NodePort, RequestHeader, ServicePort
 
 __all__ = ["Handler", "RequestInfo", "ServiceCall", "ServiceServer"]
 
@@ -184,10 +185,10 @@ class ServiceServer:
         self._taking = True
         self._counts = _Counts()
         self._ended: asyncio.Task[None] | None = None
-        srv_class, self._type_name, _ = node.describe(srv_type, qos)
-        self._name = node.resolve(srv_name)
-        self.response_type: type = srv_class.Response
-        self._port = node.open_service(srv_class, srv_name, qos, self._on_request)
+        service = node.describe(srv_type, srv_name, qos)
+        self._name, self._type_name, _ = service.key
+        self.response_type: type = service.srv_type.Response
+        self._port = node.open_service(service, self._on_request)
         self._outlet = _Outlet(self._port)
         self._qos = self._port.qos
 
@@ -585,7 +586,7 @@ class ServiceServer:
                     self._name,
                     len(stubborn),
                 )
-        await asyncio.sleep(self._port.linger)
+        await asyncio.sleep(self._port.destroy_delay)
         self.end(functools.partial(SessionClosed, f"{self._name}: the server is closed"))
 
 

@@ -14,25 +14,21 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 
 import anyio
 
-from rosasync.endings import until_done
+from rosasync.aio import until_done
 from rosasync.errors import SessionClosed, UsageError
-from rosasync.limits import (
-    Limits,
-    Retry,
-    SessionStatistics,
-    Timeout,
-    check_seconds,
-    check_timeout,
-)
+from rosasync.gateway import LoopGateway
+from rosasync.options import Limits, Retry, SessionOptions, Timeout, check_timeout
 from rosasync.pool import ClientPool, Endpoint, context_shut_down
 from rosasync.portal import Gate, Portal
 from rosasync.server import Handler, ServiceServer
+from rosasync.statistics import SessionStatistics
 
 if TYPE_CHECKING:
     from rclpy.context import Context
     from rclpy.executors import Executor
     from rclpy.node import Node
 
+    from rosasync.ports import NodePort
     from rosasync.ros.node import RosNode
 
 __all__ = ["ServiceClient", "Session"]
@@ -88,28 +84,23 @@ class Session:
         busy_poll: float = 0.0,
         introspection: Literal["off", "metadata", "contents"] = "off",
     ) -> None:
-        if introspection not in ("off", "metadata", "contents"):
-            raise ValueError(
-                f"introspection must be 'off', 'metadata' or 'contents', not {introspection!r}"
-            )
-        if bridge not in ("auto", "direct", "executor"):
-            raise ValueError(f"bridge must be 'auto', 'direct' or 'executor', not {bridge!r}")
-        if limits is not None and not isinstance(limits, Limits):
-            raise TypeError(f"limits must be a rosasync.Limits, not {type(limits).__name__}")
-        self._name = node
-        self._context = context
-        self._executor = executor
-        self._wanted_bridge = bridge
-        self._limits = Limits() if limits is None else limits
-        self._timeout = check_timeout(timeout, None)
-        self._busy_poll = check_seconds("busy_poll", busy_poll)
-        self._introspection = introspection
+        self._options = SessionOptions(
+            node=node,
+            context=context,
+            executor=executor,
+            bridge=bridge,
+            limits=Limits() if limits is None else limits,
+            timeout=timeout,
+            busy_poll=busy_poll,
+            introspection=introspection,
+        )
+        self._timeout = self._options.timeout
         self._core: _Core | None = None
         self._closed = False
 
     def __repr__(self) -> str:
         if self._core is None:
-            return f"<Session {self._name!r} not open>"
+            return f"<Session {self._options.node!r} not open>"
         state = "closed" if self._closed else f"{self.bridge} bridge, {self._core.pool!r}"
         return f"<Session {self._core.name!r} {state}>"
 
@@ -353,6 +344,13 @@ class Session:
         self._closed = True
         await self._core.aclose()
 
+    def _open_node(
+        self, gateway: LoopGateway, on_graph: Callable[[], None], on_shutdown: Callable[[], None]
+    ) -> NodePort:
+        """Open the node. A test's session overrides this, to open one in memory."""
+        ros_node: type[RosNode] = _import_ros("rosasync.ros.node").RosNode
+        return ros_node(self._options, gateway, on_graph, on_shutdown)
+
     def _open_core(self) -> _Core:
         if self._core is None:
             raise UsageError("the session is not open: use `async with rosasync.Session(…)`")
@@ -444,32 +442,18 @@ class _Core:
 
     def __init__(self, session: Session) -> None:
         self.loop = asyncio.get_running_loop()
-        self.ros = self._attach(session)
-        self.name = self.ros.node.get_name()
-        self.pool = ClientPool(self.ros, session._limits, session._timeout, self._context_shut_down)
-        self.gate = Gate(self.ros, self.pool, session._timeout)
+        self.gateway = LoopGateway()
+        self.ros = session._open_node(self.gateway, self._graph_changed, self._context_shut_down)
+        self.name = self.ros.name
+        self.pool = ClientPool(
+            self.ros, session._options.limits, session._options.timeout, self._context_shut_down
+        )
+        self.gate = Gate(self.ros, self.gateway, self.pool, session._options.timeout)
         self.portal = Portal(self.gate)
         self.servers: dict[ServiceServer, None] = {}
         self._ended: asyncio.Task[None] | None = None
         self._session = weakref.ref(session)
         atexit.register(self._exit)
-
-    def _attach(self, session: Session) -> RosNode:
-        node: Any = session._name
-        if hasattr(node, "attach"):
-            fake: RosNode = node.attach(self._graph_changed, self._context_shut_down)
-            return fake
-        ros_node: type[RosNode] = _import_ros("rosasync.ros.node").RosNode
-        return ros_node(
-            node,
-            session._context,
-            session._executor,
-            session._wanted_bridge,
-            self._graph_changed,
-            self._context_shut_down,
-            session._introspection,
-            session._busy_poll,
-        )
 
     def serve(self, srv_type: Any, srv_name: str, handler: Any, **options: Any) -> ServiceServer:
         """Make a server that ends with the session."""
@@ -499,6 +483,7 @@ class _Core:
         atexit.unregister(self._exit)
         self.ros.stop()
         self.gate.end()
+        self.gateway.close()
         if self.loop.is_closed():
             self._give_up()
         else:
@@ -521,6 +506,7 @@ class _Core:
             _warn_unclosed(session)
         self.ros.stop()
         self.gate.end()
+        self.gateway.close()
         self.ros.join()
 
     async def _end(self) -> None:
@@ -529,6 +515,7 @@ class _Core:
         self.pool.end(_session_closed)
         self.ros.stop()
         self.gate.end()
+        self.gateway.close()
         with anyio.move_on_after(ENDING, shield=True):
             await self.ros.stopped()
             self.ros.join()
@@ -536,7 +523,7 @@ class _Core:
             return
         logger.warning(
             "a callback of node %s is still running: its executor thread is left behind",
-            self.ros.node.get_name(),
+            self.ros.name,
         )
 
     def _graph_changed(self) -> None:

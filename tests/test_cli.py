@@ -15,8 +15,8 @@ from importlib.metadata import PackageNotFoundError, version
 import psutil
 import pytest
 
-from rosasync.demo import Report, Samples
-from rosasync.ros.stock import READY
+from rosasync.demo.run import Report, Samples
+from rosasync.demo.stock import READY
 
 LIMIT = 30.0
 ROSASYNC = (sys.executable, "-m", "rosasync")
@@ -142,7 +142,7 @@ def test_ctrl_c_ends_the_demo_and_its_server() -> None:
 
 
 def test_stock_server_ends_with_its_standard_input() -> None:
-    command = (sys.executable, "-m", "rosasync.ros.stock", "/rosasync_test/echo")
+    command = (sys.executable, "-m", "rosasync.demo.stock", "/rosasync_test/echo")
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as server:
         assert server.stdin is not None
         assert server.stdout is not None

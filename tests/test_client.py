@@ -9,8 +9,9 @@ from typing import Any
 import pytest
 
 from rosasync import Limits, Retry
+from rosasync.aio import Deadlines, Expired
 from rosasync.client import Call, Client, Counts
-from rosasync.deadlines import Deadlines, Expired
+from rosasync.statistics import ServiceKey
 from rosasync.testing import FakeClient, FakeGraph, FakeNode
 from tests.support.times import TICK, until
 
@@ -20,14 +21,13 @@ class Rig:
 
     def __init__(self, **limits: Any) -> None:
         self.node = FakeNode(FakeGraph())
-        self.node.attach(lambda: None, lambda: None)
         self.counts = Counts()
         self.room = 0
         self.client = Client(self._open, Limits(**limits), self.counts, self._on_room)
         self._deadlines = Deadlines()
 
     def _open(self, deliver: Callable[[int, Any], None]) -> FakeClient:
-        self.port = FakeClient(self.node, "", "/echo", deliver)
+        self.port = FakeClient(self.node, ServiceKey("/echo", ""), deliver)
         self.node.clients.append(self.port)
         return self.port
 

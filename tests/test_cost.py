@@ -34,6 +34,7 @@ WARM_UP = 200
 AT_ONCE = 10
 Call = Callable[[], Awaitable[object]]
 OWN = rosasync.__path__[0]
+TESTING = f"{OWN}/testing/"
 
 
 class Echo:
@@ -94,7 +95,7 @@ async def _count_functions(call: Call) -> tuple[float, float]:
 
     def on_event(frame: FrameType, event: str, arg: Any) -> None:
         name = frame.f_code.co_filename
-        if name.startswith(OWN) and not name.endswith("testing.py"):
+        if name.startswith(OWN) and not name.startswith(TESTING):
             counts[event] += 1
 
     sys.setprofile(on_event)

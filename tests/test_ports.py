@@ -9,8 +9,10 @@ from typing import Any, Literal
 import pytest
 
 from rosasync import InvalidServiceName
+from rosasync.gateway import LoopGateway
+from rosasync.options import Limits, SessionOptions
+from rosasync.ports import ClientPort, NodePort
 from rosasync.ros.node import RosNode
-from rosasync.ros.ports import ClientPort, NodePort
 from rosasync.testing import FakeGraph, FakeNode
 from tests.support.echo import ECHO, answer_to, fill, request_of, service_class
 from tests.support.servers import ServerProcess
@@ -38,8 +40,10 @@ class World:
         self.changes += 1
 
     def client(self, srv_name: str = "/port_echo") -> ClientPort:
-        srv_type, _, _ = self.node.describe(ECHO, None)
-        return self.node.open_client(srv_type, srv_name, None, self._deliver)
+        return self.node.open_client(self.node.describe(ECHO, srv_name, None), self._deliver)
+
+    def servers(self, srv_type: str = ECHO) -> int:
+        return len(self.node.find_servers(self.node.describe(srv_type, "/port_echo", None)))
 
     def _deliver(self, sequence_number: int, response: Any) -> None:
         self.responses.append((sequence_number, answer_to(response)))
@@ -50,7 +54,6 @@ async def world(request: pytest.FixtureRequest) -> AsyncIterator[World]:
     kind: Kind = request.param
     if kind == "fake":
         graph = FakeGraph()
-        fake = FakeNode(graph)
         response_class = service_class(ECHO).Response
 
         async def serve(name: str) -> None:
@@ -60,19 +63,29 @@ async def world(request: pytest.FixtureRequest) -> AsyncIterator[World]:
             graph.find(ECHO, name)[0].close()
 
         world = World(serve, vanish)
-        world.node = fake
-        fake.attach(world.changed, lambda: None)
+        world.node = FakeNode(graph, world.changed)
         yield world
-        fake.close()
+        world.node.close()
         return
     server: ServerProcess = request.getfixturevalue("server")
     world = World(serve=server.serve, vanish=server.stop)
-    real = RosNode("test_ports", None, None, kind, world.changed, lambda: None)
-    world.node = real
+    gateway = LoopGateway()
+    options = SessionOptions(
+        node="test_ports",
+        context=None,
+        executor=None,
+        bridge=kind,
+        limits=Limits(),
+        timeout=None,
+        busy_poll=0.0,
+        introspection="off",
+    )
+    real = world.node = RosNode(options, gateway, world.changed, lambda: None)
     yield world
     real.stop()
     await real.stopped()
     assert real.join()
+    gateway.close()
     real.close()
 
 
@@ -102,12 +115,11 @@ async def test_ready_follows_the_server(world: World) -> None:
     assert not client.ready()
     await world.serve("/port_echo")
     await until(client.ready)
-    assert world.node.servers("/port_echo") == 1
-    assert world.node.provides(ECHO, "/port_echo")
-    assert not world.node.provides("std_srvs/srv/Empty", "/port_echo")
+    assert world.servers() == 1
+    assert not world.servers("std_srvs/srv/Empty")
     await world.vanish("/port_echo")
     await until(lambda: not client.ready())
-    await until(lambda: world.node.servers("/port_echo") == 0)
+    await until(lambda: world.servers() == 0)
     client.close()
 
 
@@ -148,26 +160,28 @@ async def test_nothing_comes_after_close(world: World) -> None:
 
 
 async def test_names_are_resolved_or_refused(world: World) -> None:
-    assert world.node.resolve("port_echo") == "/port_echo"
+    assert world.node.describe(ECHO, "port_echo", None).key.srv_name == "/port_echo"
     for name in ("", "/", "/with space", "/1st", "/double//slash"):
         with pytest.raises(InvalidServiceName, match="is no service name"):
-            world.node.resolve(name)
+            world.node.describe(ECHO, name, None)
 
 
 async def test_types_and_requests_are_checked(world: World) -> None:
-    srv_type, name, qos = world.node.describe(ECHO, None)
-    assert (name, qos) == (ECHO, None)
-    request = world.node.request(srv_type, {"load_namespace": "x"})
+    service = world.node.describe(ECHO, "/port_echo", None)
+    assert service.key == ("/port_echo", ECHO, None)
+    srv_type = service.srv_type
+    request = world.node.make_request(srv_type, {"load_namespace": "x"})
     assert isinstance(request, srv_type.Request)
-    assert world.node.request(srv_type, request) is request
+    assert world.node.make_request(srv_type, request) is request
     with pytest.raises(TypeError):
-        world.node.request(srv_type, srv_type.Response())
+        world.node.make_request(srv_type, srv_type.Response())
     with pytest.raises(ValueError, match="no_such_package"):
-        world.node.describe("no_such_package/srv/Nothing", None)
+        world.node.describe("no_such_package/srv/Nothing", "/port_echo", None)
 
 
 async def test_what_is_seen_instead(world: World) -> None:
+    missing = world.node.describe(ECHO, "/port_ecco", None)
     await world.serve("/port_echo")
-    await until(lambda: world.node.servers("/port_echo"))
-    assert "/port_echo" in world.node.seen_instead(ECHO, "/port_ecco")
+    await until(world.servers)
+    assert "/port_echo" in world.node.explain_missing(missing)
     assert world.node.ok()

@@ -34,7 +34,7 @@ from rosasync import (
     SessionClosed,
     UsageError,
 )
-from rosasync.ros.ports import Unmatched
+from rosasync.ports import Unmatched
 from rosasync.ros.services import take_requests
 from tests.support.clients import ClientProcess
 from tests.support.echo import ECHO, answer_to, request_of

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from rosasync.ports import Unmatched
 from rosasync.ros import services
-from rosasync.ros.ports import Unmatched
 from rosasync.ros.services import Responder
 from rosasync.server import RESEND
 from tests.support.echo import ECHO

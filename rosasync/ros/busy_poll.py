@@ -6,7 +6,7 @@ import asyncio
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from rosasync.ros.direct import DirectClient
+    from rosasync.ros.direct_bridge import DirectClient
 
 __all__ = ["BusyPoll"]
 

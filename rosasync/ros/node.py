@@ -7,7 +7,7 @@ import contextlib
 import difflib
 import logging
 from collections.abc import Callable, Hashable
-from typing import Any, Literal
+from typing import Any
 
 import rclpy
 from rclpy.context import Context
@@ -21,14 +21,17 @@ from rclpy.service_introspection import ServiceIntrospectionState
 from rclpy.signals import SignalHandlerOptions
 from rclpy.validate_full_topic_name import validate_full_topic_name
 
-from rosasync.errors import InvalidServiceName, SessionClosed, UsageError
+from rosasync.errors import InvalidServiceName, UsageError
+from rosasync.gateway import LoopGateway
+from rosasync.options import SessionOptions
+from rosasync.ports import ClientPort, Deliver, DeliverRequest, Service, ServicePort
 from rosasync.ros import rcl
-from rosasync.ros.direct import DirectBridge
-from rosasync.ros.executor import ExecutorThread, Mailbox
-from rosasync.ros.futures import ExecutorBridge
+from rosasync.ros.direct_bridge import DirectBridge
+from rosasync.ros.executor_bridge import ExecutorBridge
+from rosasync.ros.executor_thread import ExecutorThread
 from rosasync.ros.graph import GraphWaitable
 from rosasync.ros.messages import request_message, service_type, type_name
-from rosasync.ros.ports import ClientPort, Deliver, DeliverRequest, ServicePort
+from rosasync.statistics import ServiceKey
 
 __all__ = ["RosNode"]
 
@@ -48,36 +51,28 @@ class RosNode:
     """What a session has of ROS. Made, used and closed on the loop's thread.
 
     Args:
-        node: a name, for a node and a context of its own; or a node to borrow.
-        context: for a named node, the context to make it in, which is then not shut down.
-        executor: an executor its owner spins; the node is added to it and no thread started.
-        bridge: ``"auto"``, ``"direct"`` or ``"executor"``.
-        on_graph: called on the loop's thread at a change of the graph.
+        options: the session's.
+        gateway: the way into the loop.
+        on_graph: called on the loop's thread after a change of the graph.
         on_shutdown: called on the loop's thread when the context goes down.
-        introspection: what clients and services publish of their calls: ``"off"``,
-            ``"metadata"`` or ``"contents"``.
-        busy_poll: seconds to look for a response before the loop sleeps; see `BusyPoll`.
     """
 
     def __init__(
         self,
-        node: str | Node,
-        context: Context | None,
-        executor: Executor | None,
-        bridge: Literal["auto", "direct", "executor"],
+        options: SessionOptions,
+        gateway: LoopGateway,
         on_graph: Callable[[], None],
         on_shutdown: Callable[[], None],
-        introspection: Literal["off", "metadata", "contents"] = "off",
-        busy_poll: float = 0.0,
     ) -> None:
+        node, executor = options.node, options.executor
         if not isinstance(node, str | Node):
             kind = type(node).__name__
             raise TypeError(f"node must be a name or an rclpy.node.Node, not {kind}")
         self._loop = asyncio.get_running_loop()
-        self._mailbox = Mailbox(self._loop)
+        self._gateway = gateway
         self._on_graph = on_graph
         self._on_shutdown = on_shutdown
-        self._introspection = introspection
+        self._introspection = options.introspection
         self._graph_pending = False
         self._thread: ExecutorThread | None = None
         self._thread_ended = asyncio.Event()
@@ -89,11 +84,11 @@ class RosNode:
         self._direct_rcl = rcl.load()
         self._bridge: DirectBridge | ExecutorBridge | None = None
         try:
-            self.node = self._make_node(node, context) if isinstance(node, str) else node
+            self.node = self._make_node(node, options.context) if isinstance(node, str) else node
             if executor is not None:
                 self._added = executor.add_node(self.node)
             foreign = self.node.executor
-            self._bridge = self._make_bridge(bridge, foreign, busy_poll)
+            self._bridge = self._make_bridge(options.bridge, foreign, options.busy_poll)
             if self._direct_rcl is not None and not _takes_callbacks(foreign):
                 self._waitable = GraphWaitable(self.node, self._direct_rcl, self._post_graph)
             self.node.context.on_shutdown(self._post_shutdown)
@@ -116,7 +111,12 @@ class RosNode:
         return self._waitable is not None
 
     @property
-    def thread(self) -> int | None:
+    def name(self) -> str:
+        """The node's name."""
+        return str(self.node.get_name())
+
+    @property
+    def executor_thread(self) -> int | None:
         """Identifier of the executor thread, where this node has one."""
         return None if self._thread is None else self._thread.ident
 
@@ -124,18 +124,20 @@ class RosNode:
         """Tell whether node and context are still up."""
         return bool(self.node.context.ok()) and bool(self.node.handle.pointer)
 
-    def describe(self, srv_type: Any, qos: Any) -> tuple[Any, str, Hashable]:
-        """Return the service class, the type's name, and the QoS as something to compare."""
+    def describe(self, srv_type: Any, srv_name: str, qos: Any) -> Service:
+        """Check and resolve a service."""
         if qos is not None and not isinstance(qos, QoSProfile):
             raise TypeError(f"qos must be an rclpy QoSProfile, not {type(qos).__name__}")
         srv_class = service_type(srv_type)
-        return srv_class, type_name(srv_class), None if qos is None else str(qos)
+        qos_key = None if qos is None else str(qos)
+        key = ServiceKey(self._resolve(srv_name), type_name(srv_class), qos_key)
+        return Service(srv_class, srv_name, qos, key)
 
-    def request(self, srv_type: Any, request: Any) -> Any:
+    def make_request(self, srv_type: Any, request: Any) -> Any:
         """Return a message of the request type."""
         return request_message(srv_type, request)
 
-    def resolve(self, srv_name: str) -> str:
+    def _resolve(self, srv_name: str) -> str:
         """Return the expanded and remapped name."""
         if not isinstance(srv_name, str):
             raise TypeError(f"a service name is a str, not {type(srv_name).__name__}")
@@ -151,39 +153,50 @@ class RosNode:
             reason = str(error).strip().replace("\n", " ")
             raise InvalidServiceName(f"{srv_name!r} is no service name: {reason}") from None
 
-    def open_client(self, srv_type: Any, srv_name: str, qos: Any, deliver: Deliver) -> ClientPort:
+    def open_client(self, service: Service, deliver: Deliver) -> ClientPort:
         """Make a client whose responses go to ``deliver``."""
         assert self._bridge is not None
         try:
-            return self._bridge.open_client(srv_type, srv_name, qos or default_qos(), deliver)
+            return self._bridge.open_client(
+                service.srv_type, service.srv_name, service.qos or default_qos(), deliver
+            )
         except rclpy_implementation.RCLError as error:
             if "incompatible type" in str(error):
                 raise UsageError(
-                    f"{srv_name}: this process already has a client or server of this name with "
-                    f"another type than {type_name(srv_type)}, and the middleware allows but one"
+                    f"{service.key.srv_name}: this process already has a client or server of this "
+                    f"name with another type than {service.key.srv_type}, and the middleware "
+                    "allows only one"
                 ) from error
             raise
 
-    def open_service(
-        self, srv_type: Any, srv_name: str, qos: Any, deliver: DeliverRequest
-    ) -> ServicePort:
+    def open_service(self, service: Service, deliver: DeliverRequest) -> ServicePort:
         """Make a service whose requests go to ``deliver``."""
         assert self._bridge is not None
-        return self._bridge.open_service(srv_type, srv_name, qos or default_qos(), deliver)
+        return self._bridge.open_service(
+            service.srv_type, service.srv_name, service.qos or default_qos(), deliver
+        )
 
-    def servers(self, srv_name: str) -> int:
+    def find_servers(self, service: Service) -> frozenset[Hashable]:
+        """Identify the servers that fit."""
+        name, srv_type, _ = service.key
+        if servers := self._servers(name):
+            return (
+                frozenset(range(servers))
+                if srv_type in self._served().get(name, ())
+                else frozenset()
+            )
+        return frozenset()
+
+    def _servers(self, srv_name: str) -> int:
         """Return how many servers of this resolved name the graph shows, whatever their type."""
         with self.node.handle:
             return int(self.node.handle.get_count_services(srv_name))
 
-    def provides(self, srv_type: str, srv_name: str) -> bool:
-        """Tell whether the graph shows a server of this resolved name and type."""
-        return bool(self.servers(srv_name)) and srv_type in self._served().get(srv_name, ())
-
-    def seen_instead(self, srv_type: str, srv_name: str) -> str:
-        """Say, as a clause, what the graph shows where this service is missing."""
+    def explain_missing(self, service: Service) -> str:
+        """Describe what the graph shows instead of this service, as a clause."""
+        srv_name, srv_type, _ = service.key
         services = self._served()
-        servers = self.servers(srv_name)
+        servers = self._servers(srv_name)
         if types := services.get(srv_name):
             if srv_type in types:
                 return (
@@ -198,17 +211,8 @@ class RosNode:
             return f"no server has this name; there are {listed}"
         return f"no server has this name, nor one like it, among {len(services)} services seen"
 
-    def on_other_thread(self, callback: Callable[..., object], *args: Any) -> None:
-        """Have a callback called on the loop's thread; from any thread.
-
-        Raises:
-            SessionClosed: the node is closed.
-        """
-        self._mailbox.post(callback, *args)
-
     def stop(self) -> None:
         """Ask the executor thread to end. From any thread; idempotent."""
-        self._mailbox.close()
         if self._thread is not None:
             self._thread.stop()
 
@@ -221,7 +225,7 @@ class RosNode:
         if self._thread is not None:
             await self._thread_ended.wait()
         if self._bridge is not None:
-            await asyncio.sleep(self._bridge.linger)
+            await asyncio.sleep(self._bridge.destroy_delay)
 
     def close(self) -> None:
         """Give back what was borrowed and destroy what is owned; after `stop` and `join`."""
@@ -247,7 +251,7 @@ class RosNode:
         """
         services: dict[str, set[str]] = {}
         for srv_name, types in self.node.get_service_names_and_types():
-            if self.servers(srv_name):
+            if self._servers(srv_name):
                 known = self._served_by_nodes(srv_name) if len(types) > 1 else None
                 services[srv_name] = known or set(types)
         return services
@@ -281,7 +285,7 @@ class RosNode:
         if bridge == "executor" or executor_only:
             if busy_poll:
                 raise UsageError("busy_poll needs the direct bridge, which is not in use here")
-            return ExecutorBridge(self.node, self._mailbox, self._introspect)
+            return ExecutorBridge(self.node, self._gateway, self._introspect)
         assert self._direct_rcl is not None
         return DirectBridge(self.node, self._direct_rcl, self._loop, self._introspect, busy_poll)
 
@@ -307,16 +311,14 @@ class RosNode:
     def _post_graph(self) -> None:
         if not self._graph_pending:
             self._graph_pending = True
-            with contextlib.suppress(SessionClosed):
-                self._mailbox.post(self._tell_graph)
+            self._gateway.post_if_open(self._tell_graph)
 
     def _tell_graph(self) -> None:
         self._graph_pending = False
         self._on_graph()
 
     def _post_shutdown(self) -> None:
-        with contextlib.suppress(SessionClosed):
-            self._mailbox.post(self._on_shutdown)
+        self._gateway.post_if_open(self._on_shutdown)
 
     def _post_end(self) -> None:
         with contextlib.suppress(RuntimeError):
@@ -324,10 +326,10 @@ class RosNode:
 
     def _post_error(self, error: Exception) -> None:
         context = {"message": "a callback of the node raised", "exception": error}
-        try:
-            self._mailbox.post(self._loop.call_exception_handler, context)
-        except SessionClosed:
+        if self._gateway.closed:
             logger.error("a callback of the node raised", exc_info=error)
+        else:
+            self._gateway.post_if_open(self._loop.call_exception_handler, context)
 
 
 def default_qos() -> QoSProfile:

@@ -16,7 +16,7 @@ from rclpy.qos import QoSProfile
 from rclpy.service import Service
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from rosasync.ros.ports import Undeliverable, Unmatched
+from rosasync.ports import Undeliverable, Unmatched
 
 __all__ = ["Responder", "make_service", "qos_of", "take_requests"]
 

@@ -7,7 +7,7 @@ from collections.abc import Awaitable, Callable
 
 import pytest
 
-from rosasync.eager import begin
+from rosasync.aio import begin
 
 pytestmark = pytest.mark.asyncio(loop_factories=["asyncio", "uvloop"])
 

@@ -26,7 +26,7 @@ import rosasync
 from rosasync.ros.domain import isolate
 
 if TYPE_CHECKING:
-    from rosasync.ros.stock import ThreadedClient
+    from rosasync.demo.stock import ThreadedClient
 
 __all__ = ["DemoError", "Figures", "Report", "run_demo"]
 
@@ -234,7 +234,7 @@ async def _run(calls: int, seconds: float) -> Report:
         rosasync.Session("rosasync_demo", timeout=CALL_TIMEOUT) as session,
         _stock_server(),
     ):
-        from rosasync.ros.stock import Echo
+        from rosasync.demo.stock import Echo
 
         with _stock_client() as client, ThreadPoolExecutor(max(AT_ONCE)) as threads:
             await session.wait_for_service(Echo, SRV_NAMES[OURS], timeout=START_LIMIT)
@@ -247,7 +247,7 @@ async def _run(calls: int, seconds: float) -> Report:
 
 async def _greet(session: rosasync.Session, client: ThreadedClient) -> None:
     """Make the first calls: the server may not have matched the clients that see it already."""
-    from rosasync.ros.stock import Echo, request_for
+    from rosasync.demo.stock import Echo, request_for
 
     greeting = request_for("hello")
     retry = rosasync.Retry(attempts=GREETINGS, after=GREETING_TIMEOUT, backoff=1.0)
@@ -262,10 +262,10 @@ async def _greet(session: rosasync.Session, client: ThreadedClient) -> None:
 @asynccontextmanager
 async def _stock_server() -> AsyncIterator[None]:
     """Run the server in a process of its own, out of reach of the terminal's Ctrl-C."""
-    from rosasync.ros.stock import READY
+    from rosasync.demo.stock import READY
 
     process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "rosasync.ros.stock", *SRV_NAMES.values()),
+        *(sys.executable, "-m", "rosasync.demo.stock", *SRV_NAMES.values()),
         stdin=asyncio.subprocess.PIPE,
         stdout=asyncio.subprocess.PIPE,
         start_new_session=True,
@@ -288,7 +288,7 @@ async def _stock_server() -> AsyncIterator[None]:
 
 @contextmanager
 def _stock_client() -> Iterator[ThreadedClient]:
-    from rosasync.ros.stock import ThreadedClient
+    from rosasync.demo.stock import ThreadedClient
 
     client = ThreadedClient(SRV_NAMES[STOCK])
     try:
@@ -354,7 +354,7 @@ async def _take_turn(
 async def _our_turn(
     contestants: _Contestants, shares: Iterable[range], until: float, latencies: list[float]
 ) -> None:
-    from rosasync.ros.stock import Echo, answer_of, request_for
+    from rosasync.demo.stock import Echo, answer_of, request_for
 
     async def caller(numbers: range) -> None:
         for number in numbers:
@@ -378,7 +378,7 @@ async def _our_turn(
 async def _stock_turn(
     contestants: _Contestants, shares: Iterable[range], until: float, latencies: list[float]
 ) -> None:
-    from rosasync.ros.stock import answer_of, request_for
+    from rosasync.demo.stock import answer_of, request_for
 
     stop = threading.Event()
 

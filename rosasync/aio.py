@@ -1,14 +1,19 @@
-"""The deadlines of all calls of a session, under one timer of the loop."""
+"""What asyncio lacks: shared deadlines, tasks that start at once, uncancellable waits."""
 
 from __future__ import annotations
 
 import asyncio
 import itertools
 import math
+import sys
+import types
+from collections.abc import Coroutine, Generator
 from heapq import heapify, heappop, heappush
 from typing import Any
 
-__all__ = ["Deadlines", "Expired"]
+import anyio
+
+__all__ = ["Deadlines", "Expired", "begin", "until_done"]
 
 SPARE = 64
 """Deadlines that were met and may stay in the heap, beside as many as there are others."""
@@ -77,3 +82,59 @@ class Deadlines:
                 future.set_exception(Expired())
         if heap:
             self._arm(heap[0][0])
+
+
+Work = Coroutine[Any, Any, None]
+
+
+def begin(loop: asyncio.AbstractEventLoop, work: Work) -> asyncio.Task[None] | None:
+    """Run a coroutine up to its first suspension, and the rest of it as a task.
+
+    To be called on the thread of a running loop. To cancel the task, call its ``cancel`` in a
+    later turn (``loop.call_soon``): before Python 3.12 it could not be heard in this one.
+
+    Returns:
+        The task, or None where there was nothing to wait for.
+    """
+    if sys.version_info >= (3, 12):
+        task = asyncio.Task(work, loop=loop, eager_start=True)
+        return None if task.done() else task
+    try:
+        awaited = work.send(None)
+    except StopIteration:
+        return None
+    return loop.create_task(_resume(work, awaited))
+
+
+@types.coroutine
+def _resume(work: Work, awaited: Any) -> Generator[Any, Any, None]:
+    """Go on with a coroutine that waits for what it has yielded already."""
+    try:
+        while True:
+            try:
+                value = yield awaited
+            except BaseException as error:
+                awaited = work.throw(error)
+            else:
+                awaited = work.send(value)
+    except StopIteration:
+        return
+
+
+async def until_done(task: asyncio.Task[None]) -> None:
+    """Wait for a task, whatever cancellation comes meanwhile, and pass that on afterwards.
+
+    Raises:
+        Exception: what the task raised.
+        CancelledError: the caller was cancelled; the task is done all the same.
+    """
+    cancelled = None
+    with anyio.CancelScope(shield=True):
+        while not task.done():
+            try:
+                await asyncio.wait({task})
+            except asyncio.CancelledError as error:
+                cancelled = error
+    if cancelled is not None:
+        raise cancelled
+    task.result()

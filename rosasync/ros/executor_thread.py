@@ -1,61 +1,14 @@
-"""The executor thread: spins rclpy, and brings what happens there to the loop."""
+"""The executor thread: spins an rclpy executor."""
 
 from __future__ import annotations
 
-import asyncio
-import logging
 import threading
 from collections.abc import Callable
-from typing import Any
 
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import Executor, ExternalShutdownException, ShutdownException
 
-from rosasync.errors import SessionClosed
-
-__all__ = ["ExecutorThread", "Mailbox"]
-
-logger = logging.getLogger("rosasync")
-
-
-class Mailbox:
-    """Carries calls from any thread to the loop, with one wake-up for each batch."""
-
-    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
-        self._loop = loop
-        self._lock = threading.Lock()
-        self._calls: list[tuple[Callable[..., object], tuple[Any, ...]]] = []
-        self._closed = False
-
-    def post(self, callback: Callable[..., object], *args: Any) -> None:
-        """Have ``callback(*args)`` called on the loop's thread. Any thread may post.
-
-        Raises:
-            SessionClosed: the mailbox, or the loop, is closed.
-        """
-        with self._lock:
-            if self._closed or self._loop.is_closed():
-                raise SessionClosed("the session is closed")
-            self._calls.append((callback, args))
-            if len(self._calls) == 1:
-                self._loop.call_soon_threadsafe(self._drain)
-
-    def close(self) -> None:
-        """Take no more, and drop what has not been delivered."""
-        with self._lock:
-            self._closed = True
-            self._calls = []
-
-    def _drain(self) -> None:
-        with self._lock:
-            calls, self._calls = self._calls, []
-        for callback, args in calls:
-            try:
-                callback(*args)
-            except Exception as error:
-                self._loop.call_exception_handler(
-                    {"message": f"{callback!r} failed", "exception": error}
-                )
+__all__ = ["ExecutorThread"]
 
 
 class ExecutorThread:

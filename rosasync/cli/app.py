@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from rosasync.demo import DemoError, run_demo
+from rosasync.demo.run import DemoError, run_demo
 
 __all__ = ["app"]
 

@@ -10,20 +10,20 @@ from typing import Any
 from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 
+from rosasync.ports import Deliver, DeliverRequest, RequestHeader
 from rosasync.ros.busy_poll import BusyPoll
-from rosasync.ros.ports import Deliver, DeliverRequest, RequestHeader
 from rosasync.ros.rcl import Rcl
 from rosasync.ros.services import Responder, make_service, qos_of, take_requests
 from rosasync.ros.signals import Signal, Signals
 
-__all__ = ["LINGER", "DirectBridge", "Reserved"]
+__all__ = ["DESTROY_DELAY", "DirectBridge", "DirectCallbackGroup"]
 
-LINGER = 0.02
+DESTROY_DELAY = 0.02
 """Seconds from the end of signalling to the destruction: a thread of the middleware may be on its
 way into the listener, which it then uses after it was freed (rmw_fastrtps issue 632)."""
 
 
-class Reserved(CallbackGroup):  # type: ignore[misc]
+class DirectCallbackGroup(CallbackGroup):  # type: ignore[misc]
     """Keeps its clients and services from every executor: the loop takes from them itself.
 
     An executor ignores an entity whose group answers False here (rclpy, executors.py).
@@ -45,7 +45,7 @@ class DirectBridge:
     """Takes responses and requests on the loop's thread, when the middleware says so."""
 
     name = "direct"
-    linger = LINGER
+    destroy_delay = DESTROY_DELAY
 
     def __init__(
         self,
@@ -58,7 +58,7 @@ class DirectBridge:
         self._node = node
         self._configure = configure
         self._rcl = rcl
-        self._group = Reserved()
+        self._group = DirectCallbackGroup()
         self._clients: Signals[DirectClient] = Signals(loop, _take_responses)
         self._services: Signals[DirectService] = Signals(loop, _take_requests)
         self._poll = BusyPoll(loop, busy_poll) if busy_poll else None
@@ -97,7 +97,7 @@ class DirectBridge:
         if self._loop.is_closed():
             self._node.destroy_client(client)
         else:
-            self._retired[client] = self._loop.call_later(LINGER, self._destroy, client)
+            self._retired[client] = self._loop.call_later(DESTROY_DELAY, self._destroy, client)
 
     def _destroy(self, client: Any) -> None:
         self._retired.pop(client).cancel()
@@ -236,7 +236,7 @@ class DirectClient:
 class DirectService:
     """A rcl service that the loop's thread takes from."""
 
-    linger = LINGER
+    destroy_delay = DESTROY_DELAY
 
     def __init__(
         self,
@@ -311,4 +311,4 @@ def _take_requests(signal: Signal[DirectService], signalled: int) -> None:
 
 
 def _nothing(request: object, response: object) -> None:
-    """Is never called: no executor takes from a service of the group `Reserved`."""
+    """Is never called: no executor takes from a service of the group `DirectCallbackGroup`."""

@@ -1,6 +1,6 @@
 """Plain rclpy on both ends, to show rosasync beside: a server process and threaded ``client.call``.
 
-``python -m rosasync.ros.stock SRV_NAME …`` serves those names until its standard input ends.
+``python -m rosasync.demo.stock SRV_NAME …`` serves those names until its standard input ends.
 """
 
 from __future__ import annotations

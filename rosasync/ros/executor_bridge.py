@@ -14,8 +14,8 @@ from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 
 from rosasync.errors import SessionClosed
-from rosasync.ros.executor import Mailbox
-from rosasync.ros.ports import Deliver, DeliverRequest, RequestHeader
+from rosasync.gateway import LoopGateway
+from rosasync.ports import Deliver, DeliverRequest, RequestHeader
 from rosasync.ros.services import Responder, make_service, qos_of
 
 __all__ = ["ExecutorBridge"]
@@ -28,29 +28,31 @@ class ExecutorBridge:
     """Has the executor take responses and requests, and brings them to the loop by a mailbox."""
 
     name = "executor"
-    linger = 0.0
+    destroy_delay = 0.0
 
-    def __init__(self, node: Node, mailbox: Mailbox, configure: Callable[[Any], None]) -> None:
+    def __init__(self, node: Node, gateway: LoopGateway, configure: Callable[[Any], None]) -> None:
         self._node = node
         self._configure = configure
-        self._mailbox = mailbox
+        self._gateway = gateway
         # A group of their own, so that no other callback of the node holds the clients back.
         self._group = ReentrantCallbackGroup()
-        self._services: weakref.WeakSet[FutureService] = weakref.WeakSet()
+        self._services: weakref.WeakSet[ExecutorService] = weakref.WeakSet()
 
-    def open_client(self, srv_type: Any, srv_name: str, qos: Any, deliver: Deliver) -> FutureClient:
+    def open_client(
+        self, srv_type: Any, srv_name: str, qos: Any, deliver: Deliver
+    ) -> ExecutorClient:
         """Make a client whose responses go to ``deliver``, on the loop's thread."""
         client = self._node.create_client(
             srv_type, srv_name, qos_profile=qos, callback_group=self._group
         )
         self._configure(client)
-        return FutureClient(self._node, client, self._mailbox, deliver)
+        return ExecutorClient(self._node, client, self._gateway, deliver)
 
     def open_service(
         self, srv_type: Any, srv_name: str, qos: Any, deliver: DeliverRequest
-    ) -> FutureService:
+    ) -> ExecutorService:
         """Make a service whose requests go to ``deliver``, on the loop's thread."""
-        service = FutureService(self._node, self._mailbox, deliver)
+        service = ExecutorService(self._node, self._gateway, deliver)
         service.open(srv_type, srv_name, qos, self._configure)
         self._services.add(service)
         return service
@@ -61,13 +63,13 @@ class ExecutorBridge:
             service.close()
 
 
-class FutureClient:
+class ExecutorClient:
     """A rclpy client whose futures complete in the executor's thread."""
 
-    def __init__(self, node: Node, client: Any, mailbox: Mailbox, deliver: Deliver) -> None:
+    def __init__(self, node: Node, client: Any, gateway: LoopGateway, deliver: Deliver) -> None:
         self._node = node
         self._client = client
-        self._mailbox = mailbox
+        self._gateway = gateway
         self._deliver = deliver
         self.handle = client.handle
         self.ready = client.service_is_ready
@@ -99,14 +101,14 @@ class FutureClient:
         if not future.cancelled():
             # After the close there is nobody to be told.
             with contextlib.suppress(SessionClosed):
-                self._mailbox.post(self._arrived, number, future)
+                self._gateway.post(self._arrived, number, future)
 
     def _arrived(self, number: int, future: Any) -> None:
         if self._out.pop(number, None) is not None:
             self._deliver(number, future.result())
 
 
-class FutureService:
+class ExecutorService:
     """A rclpy service whose requests the executor takes, and whose responses are ours to send.
 
     The executor calls ``callback(request, response)`` and then
@@ -115,14 +117,14 @@ class FutureService:
     executor goes on at once, whenever the response will be sent.
     """
 
-    linger = 0.0
+    destroy_delay = 0.0
 
-    def __init__(self, node: Node, mailbox: Mailbox, deliver: DeliverRequest) -> None:
+    def __init__(self, node: Node, gateway: LoopGateway, deliver: DeliverRequest) -> None:
         self._node = node
-        self._mailbox = mailbox
+        self._gateway = gateway
         self._deliver = deliver
         # One at a time, so that requests keep their order in a MultiThreadedExecutor.
-        self._group = _Shut()
+        self._group = GatedCallbackGroup()
         self._stopped = False
         self._closed = False
 
@@ -164,20 +166,20 @@ class FutureService:
         An executor that waits again before every request is too slow for its queue.
         """
         with contextlib.suppress(SessionClosed, InvalidHandle):
-            self._mailbox.post(self._arrived, request, header)
+            self._gateway.post(self._arrived, request, header)
             with self.handle.handle:
                 for _ in range(BATCH):
                     request, header = self._take(self._request_type)
                     if header is None:
                         break
-                    self._mailbox.post(self._arrived, request, header)
+                    self._gateway.post(self._arrived, request, header)
 
     def _arrived(self, request: Any, header: Any) -> None:
         if not self._stopped:
             self._deliver(request, header)
 
 
-class _Shut(MutuallyExclusiveCallbackGroup):  # type: ignore[misc]
+class GatedCallbackGroup(MutuallyExclusiveCallbackGroup):  # type: ignore[misc]
     """Keeps its service from every executor until it is opened."""
 
     shut = True

@@ -1,4 +1,4 @@
-"""A ROS graph in memory, with faults on demand, and pytest fixtures: tests without a middleware.
+"""A ROS graph in memory, with faults on demand: tests without a middleware.
 
 ::
 
@@ -8,9 +8,6 @@
         async with graph.session() as session:
             with graph.delay_responses(0.1):
                 assert (await session.call(SetBool, "/arm/enable", {"data": True})).success
-
-As a pytest plugin (``pytest_plugins = ["rosasync.testing"]``) it brings the fixtures ``fake_graph``
-and ``ros_domain``.
 """
 
 from __future__ import annotations
@@ -24,13 +21,12 @@ from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import Any
 
-import pytest
-
 from rosasync.errors import InvalidServiceName
-from rosasync.ros.domain import isolate
+from rosasync.gateway import LoopGateway
+from rosasync.ports import Deliver, DeliverRequest, Service, Undeliverable
 from rosasync.ros.messages import request_message, service_type, type_name
-from rosasync.ros.ports import Deliver, DeliverRequest, Undeliverable
 from rosasync.session import Session
+from rosasync.statistics import ServiceKey
 
 __all__ = [
     "FakeClient",
@@ -38,8 +34,6 @@ __all__ = [
     "FakeNode",
     "FakeServer",
     "FakeService",
-    "fake_graph",
-    "ros_domain",
 ]
 
 
@@ -89,7 +83,7 @@ class FakeServer:
 
 @dataclass(frozen=True)
 class FakeHeader:
-    """The header of a fake request: a `rosasync.ros.ports.RequestHeader`, and its own id."""
+    """The header of a fake request: a `rosasync.ports.RequestHeader`, and its own id."""
 
     client: FakeClient
     sequence_number: int
@@ -103,7 +97,7 @@ class FakeHeader:
 
 
 class FakeService(FakeServer):
-    """A service that a session serves in a `FakeGraph`: a `rosasync.ros.ports.ServicePort`.
+    """A service that a session serves in a `FakeGraph`: a `rosasync.ports.ServicePort`.
 
     Attributes:
         sent: the responses sent, in order, as they then were.
@@ -111,7 +105,8 @@ class FakeService(FakeServer):
 
     handle = None
     qos = None
-    linger = 0.0
+    destroy_delay = 0.0
+    destroyed = False
 
     def __init__(
         self, graph: FakeGraph, srv_type: Any, srv_name: str, deliver: DeliverRequest
@@ -184,7 +179,7 @@ class FakeGraph:
 
     def session(self, **options: Any) -> Session:
         """Make a session in this graph; options as for `rosasync.Session`."""
-        return Session(FakeNode(self), **options)
+        return FakeSession(self, **options)
 
     def changed(self) -> None:
         """Tell every node that the graph has changed."""
@@ -232,27 +227,39 @@ class FakeGraph:
         ]
 
 
+class FakeSession(Session):
+    """A session in a `FakeGraph`."""
+
+    def __init__(self, graph: FakeGraph, **options: Any) -> None:
+        super().__init__("fake", **options)
+        self._graph = graph
+
+    def _open_node(
+        self, gateway: LoopGateway, on_graph: Callable[[], None], on_shutdown: Callable[[], None]
+    ) -> FakeNode:
+        return FakeNode(self._graph, on_graph, on_shutdown)
+
+
 class FakeNode:
-    """A node of a `FakeGraph`: a `rosasync.ros.ports.NodePort`, and all a session asks for."""
+    """A node of a `FakeGraph`: a `rosasync.ports.NodePort`, and all a session asks for."""
 
+    name = "fake"
     bridge = "fake"
-    thread: int | None = None
+    executor_thread: int | None = None
 
-    def __init__(self, graph: FakeGraph) -> None:
+    def __init__(
+        self,
+        graph: FakeGraph,
+        on_graph: Callable[[], None] = lambda: None,
+        on_shutdown: Callable[[], None] = lambda: None,
+    ) -> None:
         self.graph = graph
         self.node = self
         self.up = True
         self.clients: list[FakeClient] = []
-        self.on_graph: Callable[[], None] = lambda: None
-        self.on_shutdown: Callable[[], None] = lambda: None
-
-    def attach(self, on_graph: Callable[[], None], on_shutdown: Callable[[], None]) -> FakeNode:
-        """Join the graph; called by the session, in its loop."""
-        self._loop = asyncio.get_running_loop()
         self.on_graph = on_graph
         self.on_shutdown = on_shutdown
-        self.graph.nodes.append(self)
-        return self
+        graph.nodes.append(self)
 
     def shutdown(self) -> None:
         """Have the context go down under the session."""
@@ -268,56 +275,43 @@ class FakeNode:
         """Tell whether the context is up."""
         return self.up
 
-    def get_name(self) -> str:
-        """Return the node's name."""
-        return "fake"
-
-    def describe(self, srv_type: Any, qos: Any) -> tuple[Any, str, Hashable]:
-        """Return the service class, the type's name, and the QoS."""
+    def describe(self, srv_type: Any, srv_name: str, qos: Any) -> Service:
+        """Check and resolve a service."""
         srv_class = service_type(srv_type)
-        return srv_class, type_name(srv_class), qos
+        key = ServiceKey(self._resolve(srv_name), type_name(srv_class), qos)
+        return Service(srv_class, srv_name, qos, key)
 
-    def request(self, srv_type: Any, request: Any) -> Any:
+    def make_request(self, srv_type: Any, request: Any) -> Any:
         """Return a message of the request type."""
         return request_message(srv_type, request)
 
-    def resolve(self, srv_name: str) -> str:
+    def _resolve(self, srv_name: str) -> str:
         """Return the name with a leading slash."""
         name = srv_name if srv_name.startswith("/") else f"/{srv_name}"
         if not all(part.isidentifier() for part in name[1:].split("/")):
             raise InvalidServiceName(f"{srv_name!r} is no service name")
         return name
 
-    def open_client(self, srv_type: Any, srv_name: str, qos: Any, deliver: Deliver) -> FakeClient:
+    def open_client(self, service: Service, deliver: Deliver) -> FakeClient:
         """Make a client whose responses go to ``deliver``."""
-        client = FakeClient(self, type_name(srv_type), self.resolve(srv_name), deliver)
+        client = FakeClient(self, service.key, deliver)
         self.clients.append(client)
         return client
 
-    def open_service(
-        self, srv_type: Any, srv_name: str, qos: Any, deliver: DeliverRequest
-    ) -> FakeService:
+    def open_service(self, service: Service, deliver: DeliverRequest) -> FakeService:
         """Make a service whose requests go to ``deliver``."""
-        service = FakeService(self.graph, srv_type, self.resolve(srv_name), deliver)
-        self.graph.servers.append(service)
+        opened = FakeService(self.graph, service.srv_type, service.key.srv_name, deliver)
+        self.graph.servers.append(opened)
         self.graph.changed()
-        return service
+        return opened
 
-    def servers(self, srv_name: str) -> int:
-        """Return how many servers have this name."""
-        return sum(server.srv_name == srv_name for server in self.graph.servers)
+    def find_servers(self, service: Service) -> frozenset[Hashable]:
+        """Identify the servers of this name and type."""
+        return frozenset(map(id, self.graph.find(service.key.srv_type, service.key.srv_name)))
 
-    def provides(self, srv_type: str, srv_name: str) -> bool:
-        """Tell whether there is a server of this name and type."""
-        return bool(self.graph.find(srv_type, srv_name))
-
-    def seen_instead(self, srv_type: str, srv_name: str) -> str:
-        """Say what the graph holds."""
+    def explain_missing(self, service: Service) -> str:
+        """Describe what the graph holds."""
         return f"the graph has {sorted(server.srv_name for server in self.graph.servers)}"
-
-    def on_other_thread(self, callback: Callable[..., object], *args: Any) -> None:
-        """Have a callback called on the loop's thread."""
-        self._loop.call_soon_threadsafe(callback, *args)
 
     def stop(self) -> None:
         """There is no thread."""
@@ -336,7 +330,7 @@ class FakeNode:
 
 
 class FakeClient:
-    """A client of a `FakeNode`: a `rosasync.ros.ports.ClientPort`.
+    """A client of a `FakeNode`: a `rosasync.ports.ClientPort`.
 
     Attributes:
         sent: the numbers of the requests sent, in order.
@@ -344,10 +338,9 @@ class FakeClient:
         most: how many were out at once at the most.
     """
 
-    def __init__(self, node: FakeNode, srv_type: str, srv_name: str, deliver: Deliver) -> None:
+    def __init__(self, node: FakeNode, key: ServiceKey, deliver: Deliver) -> None:
         self.node = node
-        self.srv_type = srv_type
-        self.srv_name = srv_name
+        self.srv_name, self.srv_type, _ = key
         self.closed = False
         self.sent: list[int] = []
         self.out: set[int] = set()
@@ -383,22 +376,10 @@ class FakeClient:
 
     def ready(self) -> bool:
         """Tell whether there is a server."""
-        return self.node.provides(self.srv_type, self.srv_name)
+        return bool(self.node.graph.find(self.srv_type, self.srv_name))
 
     def close(self) -> None:
         """Leave the node; idempotent."""
         if not self.closed:
             self.closed = True
             self.node.clients.remove(self)
-
-
-@pytest.fixture
-def fake_graph() -> FakeGraph:
-    """An empty graph in memory."""
-    return FakeGraph()
-
-
-@pytest.fixture(scope="session")
-def ros_domain() -> int:
-    """A ROS domain of the test run's own; see `rosasync.ros.domain.isolate`."""
-    return isolate()

@@ -1,0 +1,1 @@
+"""The demo: rosasync beside threaded ``client.call``, on a stock server in another process."""

@@ -1,0 +1,117 @@
+"""The way into a session's loop from other threads."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import threading
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from rosasync.errors import SessionClosed
+
+__all__ = ["LoopGateway", "Pending"]
+
+
+class Pending(Protocol):
+    """An operation that another thread has requested and the loop has not finished."""
+
+    def fail(self, error: Exception) -> None:
+        """End with an error, unless it has ended already. From any thread."""
+
+
+class LoopGateway:
+    """Runs callbacks on the loop's thread, with one wake-up for each batch.
+
+    Created on the loop's thread; every method may be called from any thread. Operations that are
+    registered and unfinished when the session ends fail with `SessionClosed`, including those whose
+    callbacks have not run yet.
+    """
+
+    def __init__(self) -> None:
+        self.loop = asyncio.get_running_loop()
+        self._thread = threading.get_ident()
+        # Reentrant, because the garbage collector may run any __del__ inside `post`.
+        self._lock = threading.RLock()
+        self._calls: list[tuple[Callable[..., object], tuple[Any, ...]]] = []
+        # Changed by single operations only, which are atomic.
+        self._pending: dict[Pending, None] = {}
+        self._closed = False
+
+    @property
+    def on_loop(self) -> bool:
+        """Whether the caller runs on the loop's thread, inside the loop."""
+        return asyncio._get_running_loop() is self.loop
+
+    @property
+    def on_thread(self) -> bool:
+        """Whether the caller runs on the thread that opened the session."""
+        return threading.get_ident() == self._thread
+
+    @property
+    def closed(self) -> bool:
+        """Whether the gateway, or the loop, is closed."""
+        return self._closed or self.loop.is_closed()
+
+    def check_open(self) -> None:
+        """Raise `SessionClosed` if the gateway, or the loop, is closed."""
+        if self.closed:
+            raise SessionClosed("the session is closed")
+
+    def post(self, callback: Callable[..., object], *args: Any) -> None:
+        """Call ``callback(*args)`` on the loop's thread, in a later turn.
+
+        Raises:
+            SessionClosed: the gateway, or the loop, is closed.
+        """
+        with self._lock:
+            self.check_open()
+            self._calls.append((callback, args))
+            if len(self._calls) == 1:
+                try:
+                    self.loop.call_soon_threadsafe(self._drain)
+                except RuntimeError:
+                    # The loop was closed by its own thread in between.
+                    self._calls.clear()
+            self.check_open()
+
+    def post_if_open(self, callback: Callable[..., object], *args: Any) -> None:
+        """Call ``callback(*args)`` as `post` does, or do nothing if the gateway is closed."""
+        with contextlib.suppress(SessionClosed):
+            self.post(callback, *args)
+
+    def call(self, callback: Callable[..., object], *args: Any) -> None:
+        """Call ``callback(*args)`` at once on the loop's thread, otherwise as `post` does."""
+        if self.on_loop:
+            self.check_open()
+            callback(*args)
+        else:
+            self.post(callback, *args)
+
+    def register(self, operation: Pending) -> None:
+        """Fail this operation if the session ends before it is discarded."""
+        self._pending[operation] = None
+
+    def discard(self, operation: Pending) -> None:
+        """Mark an operation as finished; idempotent."""
+        self._pending.pop(operation, None)
+
+    def close(self) -> None:
+        """Drop the callbacks that have not run, and fail the operations; idempotent."""
+        with self._lock:
+            self._closed = True
+            self._calls = []
+        for operation in tuple(self._pending):
+            operation.fail(SessionClosed("the session is closed"))
+        self._pending.clear()
+
+    def _drain(self) -> None:
+        with self._lock:
+            calls, self._calls = self._calls, []
+        for callback, args in calls:
+            try:
+                callback(*args)
+            except Exception as error:
+                self.loop.call_exception_handler(
+                    {"message": f"{callback!r} failed", "exception": error}
+                )

@@ -1,0 +1,22 @@
+"""The pytest plugin: fixtures for a graph in memory and for a ROS domain of the run's own."""
+
+from __future__ import annotations
+
+import pytest
+
+from rosasync.ros.domain import isolate
+from rosasync.testing.graph import FakeGraph
+
+__all__ = ["fake_graph", "ros_domain"]
+
+
+@pytest.fixture
+def fake_graph() -> FakeGraph:
+    """An empty graph in memory."""
+    return FakeGraph()
+
+
+@pytest.fixture(scope="session")
+def ros_domain() -> int:
+    """A ROS domain of the test run's own; see `rosasync.ros.domain.isolate`."""
+    return isolate()
