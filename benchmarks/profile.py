@@ -232,8 +232,9 @@ async def _measure(work: Work, calls: int, stamps: Stamps) -> Profile:
 def _stamping(session: rosasync.Session, stamps: Stamps) -> Iterator[None]:
     """Puts stamps where the session's one client touches the middleware, for one call."""
     pool: Any = session.pool
-    (endpoint,) = pool._endpoints.values()
-    port: Any = endpoint.clients[0]._port
+    (service,) = pool._services.values()
+    (client,) = service._clients
+    port: Any = client._port
     kept = (port.send_request, port._take, port._deliver, os.eventfd_read)
     port.send_request = stamps.around(port.send_request, "send", "sent")
     port._take = stamps.around(port._take, "take", "taken")

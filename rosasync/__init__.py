@@ -20,6 +20,7 @@ from rosasync.options import Limits, Retry
 from rosasync.pool import ClientPool, LeasedClient
 from rosasync.portal import Portal
 from rosasync.proxy import AsyncServiceProxy, ProxyState
+from rosasync.ros.messages import to_dict, to_message
 from rosasync.server import RequestInfo, ServiceCall, ServiceServer
 from rosasync.session import ServiceClient, Session
 from rosasync.statistics import (
@@ -29,6 +30,7 @@ from rosasync.statistics import (
     ServiceKey,
     SessionStatistics,
 )
+from rosasync.typing import ServiceType
 
 __all__ = [
     "AsyncServiceProxy",
@@ -54,10 +56,13 @@ __all__ = [
     "ServiceClient",
     "ServiceKey",
     "ServiceServer",
+    "ServiceType",
     "ServiceUnavailable",
     "Session",
     "SessionClosed",
     "SessionStatistics",
     "UsageError",
+    "to_dict",
+    "to_message",
     "wrap_future",
 ]

@@ -5,76 +5,76 @@ from __future__ import annotations
 import asyncio
 import itertools
 import math
-import sys
-import types
 from collections.abc import Coroutine, Generator
 from heapq import heapify, heappop, heappush
-from typing import Any
+from typing import Any, TypeVar
 
 import anyio
 
-__all__ = ["Deadlines", "Expired", "begin", "until_done"]
+__all__ = ["Deadlines", "Expired", "start_task", "until_done"]
+
+T = TypeVar("T")
 
 SPARE = 64
-"""Deadlines that were met and may stay in the heap, beside as many as there are others."""
+"""How many met deadlines the heap may hold, in addition to one for each that is not met."""
 
 Entry = list[Any]
-"""A deadline, a number that no other has, and the future; put None there when it is met."""
+"""A deadline, a unique number, and the future; set the last to None when the deadline is met."""
 
 
 class Expired(Exception):
-    """The deadline passed: for the pool to turn into an error that tells the phase."""
+    """The deadline passed. The pool turns this into an error that names the phase."""
 
 
 class Deadlines:
     """Fails futures with `Expired` at their deadlines. Confined to the loop's thread.
 
-    A timer of the loop for each call is dear, and hardly any call lives to see it run out. So there
-    is one, set to the first deadline; a call that is answered leaves it as it is, and the next
-    call most often finds it early enough.
+    A timer of the loop for each call is expensive, and rarely fires. So there is one timer, set to
+    the earliest deadline. A call that is answered leaves it running, and it usually serves the next
+    call as well.
     """
 
     def __init__(self) -> None:
         self._loop = asyncio.get_running_loop()
         self._heap: list[Entry] = []
         self._numbers = itertools.count()
-        self._most = SPARE
+        self._limit = SPARE
         self._timer: asyncio.TimerHandle | None = None
-        self._first = math.inf
+        self._earliest = math.inf
 
     def set(self, future: asyncio.Future[Any], deadline: float) -> Entry:
-        """Fail a future at a time of the loop's, unless it is done, or gone from the entry."""
+        """Fail a future at ``deadline``, in loop time, unless it is done or taken out by then."""
         entry: Entry = [deadline, next(self._numbers), future]
         heap = self._heap
         heappush(heap, entry)
-        if len(heap) > self._most:
+        if len(heap) > self._limit:
             self._sweep()
-        if deadline < self._first:
+        if deadline < self._earliest:
             self._arm(deadline)
         return entry
 
     def close(self) -> None:
-        """Forget every future; idempotent."""
+        """Drop all deadlines; idempotent."""
         self._heap.clear()
-        self._first = math.inf
+        self._earliest = math.inf
         if self._timer is not None:
             self._timer.cancel()
 
     def _sweep(self) -> None:
         self._heap = [entry for entry in self._heap if entry[-1] is not None]
         heapify(self._heap)
-        self._most = 2 * len(self._heap) + SPARE
+        self._limit = 2 * len(self._heap) + SPARE
 
     def _arm(self, deadline: float) -> None:
         if self._timer is not None:
             self._timer.cancel()
-        self._first = deadline
+        self._earliest = deadline
         self._timer = self._loop.call_at(deadline, self._expire, deadline)
 
     def _expire(self, deadline: float) -> None:
-        # The loop may call a little early: its clock is coarser than its times.
+        # The loop may call slightly early, because its clock is coarser than its times.
         now = max(deadline, self._loop.time())
-        self._first = math.inf
+        self._earliest = math.inf
         heap = self._heap
         while heap and (heap[0][0] <= now or heap[0][-1] is None):
             future = heappop(heap)[-1]
@@ -84,48 +84,69 @@ class Deadlines:
             self._arm(heap[0][0])
 
 
-Work = Coroutine[Any, Any, None]
+def start_task(
+    loop: asyncio.AbstractEventLoop, coroutine: Coroutine[Any, Any, T]
+) -> asyncio.Task[T]:
+    """Run a coroutine up to its first suspension, and the rest as a task.
 
-
-def begin(loop: asyncio.AbstractEventLoop, work: Work) -> asyncio.Task[None] | None:
-    """Run a coroutine up to its first suspension, and the rest of it as a task.
-
-    To be called on the thread of a running loop. To cancel the task, call its ``cancel`` in a
-    later turn (``loop.call_soon``): before Python 3.12 it could not be heard in this one.
-
-    Returns:
-        The task, or None where there was nothing to wait for.
+    As ``asyncio.Task(…, eager_start=True)`` of Python 3.12, which 3.11 lacks and which bypasses the
+    loop's task factory. Call it on the thread of the running loop. The coroutine must not look at
+    ``asyncio.current_task()`` before its first suspension.
     """
-    if sys.version_info >= (3, 12):
-        task = asyncio.Task(work, loop=loop, eager_start=True)
-        return None if task.done() else task
-    try:
-        awaited = work.send(None)
-    except StopIteration:
-        return None
-    return loop.create_task(_resume(work, awaited))
+    return loop.create_task(_Started(coroutine))
 
 
-@types.coroutine
-def _resume(work: Work, awaited: Any) -> Generator[Any, Any, None]:
-    """Go on with a coroutine that waits for what it has yielded already."""
-    try:
-        while True:
-            try:
-                value = yield awaited
-            except BaseException as error:
-                awaited = work.throw(error)
-            else:
-                awaited = work.send(value)
-    except StopIteration:
-        return
+class _Started(Coroutine[Any, Any, T]):
+    """A coroutine that has already run up to its first suspension, or to its end.
+
+    It is an object, and not a generator, so that a cancellation before the task's first step
+    reaches the coroutine.
+    """
+
+    def __init__(self, coroutine: Coroutine[Any, Any, T]) -> None:
+        self._coroutine = coroutine
+        # asyncio shows this in the repr of a task.
+        self.__qualname__ = getattr(coroutine, "__qualname__", repr(coroutine))
+        self._awaited: Any = None
+        self._outcome: BaseException | None = None
+        self._resumed = False
+        try:
+            self._awaited = coroutine.send(None)
+        except (Exception, asyncio.CancelledError) as outcome:
+            self._outcome = outcome
+
+    def send(self, value: Any) -> Any:
+        """Yield what the coroutine awaits already, then resume it."""
+        if self._resumed:
+            return self._coroutine.send(value)
+        self._resumed = True
+        if self._outcome is not None:
+            raise self._outcome
+        return self._awaited
+
+    def throw(self, *error: Any) -> Any:
+        """Raise an exception in the coroutine, or its outcome if it has ended."""
+        first, self._resumed = not self._resumed, True
+        if self._outcome is not None:
+            raise self._outcome
+        if first and self._awaited is not None:
+            # The task does not know yet what it waits for.
+            self._awaited.cancel()
+        return self._coroutine.throw(*error)
+
+    def close(self) -> None:
+        """Close the coroutine."""
+        self._coroutine.close()
+
+    def __await__(self) -> Generator[Any, Any, T]:
+        raise RuntimeError("a started coroutine runs as a task, it cannot be awaited")
 
 
 async def until_done(task: asyncio.Task[None]) -> None:
-    """Wait for a task, whatever cancellation comes meanwhile, and pass that on afterwards.
+    """Wait for a task to end. A cancellation is delivered afterwards.
 
     Raises:
-        Exception: what the task raised.
+        Exception: the task raised it.
         CancelledError: the caller was cancelled; the task is done all the same.
     """
     cancelled = None

@@ -14,47 +14,56 @@ Ticked in the loop, with an ``await`` between ticks, or in a thread of the tree'
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, Generic
 
 from rosasync.errors import UsageError
 from rosasync.options import check_timeout
 from rosasync.proxy import AsyncServiceProxy, ProxyState
+from rosasync.typing import RequestT, ResponseT, ServiceType, Timeout
 
 try:
     from py_trees.behaviour import Behaviour
     from py_trees.common import Access, Status
 except ImportError as error:
     raise ImportError(
-        f"rosasync.behaviours needs py_trees, which does not import here ({error}): "
+        f"rosasync.behaviours needs py_trees, which cannot be imported here ({error}): "
         "pip install 'rosasync[py-trees]'"
     ) from error
 
 if TYPE_CHECKING:
+    from rclpy.qos import QoSProfile
+
     from rosasync.session import Session
 
 __all__ = ["CallService", "FromBlackboard", "FromConstant", "WaitForService"]
 
 
-class ServiceBehaviour(Behaviour):  # type: ignore[misc]
-    """What both behaviours share: a proxy from setup to shutdown."""
+class ServiceBehaviour(Behaviour, Generic[RequestT, ResponseT]):  # type: ignore[misc]
+    """The base of both behaviours: it has a proxy from setup to shutdown."""
 
     def __init__(
-        self, name: str, srv_type: Any, srv_name: str, qos: Any, session: Session | None
+        self,
+        name: str,
+        srv_type: ServiceType[RequestT, ResponseT] | str,
+        srv_name: str,
+        qos: QoSProfile | None,
+        session: Session | None,
     ) -> None:
         super().__init__(name)
         self.srv_type = srv_type
         self.srv_name = srv_name
         self._qos = qos
         self._session = session
-        self._proxy: AsyncServiceProxy | None = None
+        self._proxy: AsyncServiceProxy[RequestT, ResponseT] | None = None
 
     def setup(self, **kwargs: Any) -> None:
-        """Take the session, from the constructor or ``tree.setup(session=…)``; never blocks.
+        """Take the session from the constructor or from ``tree.setup(session=…)``; never blocks.
 
         Raises:
-            KeyError: neither gave one.
-            TypeError, ValueError: there is no such service type, or that is no QoS.
+            KeyError: there is no session.
+            TypeError, ValueError: the service type does not exist, or the QoS is not a
+                ``QoSProfile``.
             InvalidServiceName: ROS does not allow the name.
             SessionClosed: the session is closed.
         """
@@ -65,83 +74,88 @@ class ServiceBehaviour(Behaviour):  # type: ignore[misc]
         self._proxy = AsyncServiceProxy(session, self.srv_type, self.srv_name, qos=self._qos)
 
     def terminate(self, new_status: Status) -> None:
-        """Cancel what is under way, where the behaviour is interrupted."""
+        """Cancel the operation if the behaviour is interrupted."""
         if new_status is Status.INVALID and self._proxy is not None:
             self._proxy.stop_call()
 
     def shutdown(self) -> None:
-        """Cancel what is under way, for good; another `setup` begins anew."""
+        """Cancel the operation, for good; another `setup` starts again."""
         if self._proxy is not None:
             self._proxy.shutdown()
             self._proxy = None
 
     @property
-    def proxy(self) -> AsyncServiceProxy:
+    def proxy(self) -> AsyncServiceProxy[RequestT, ResponseT]:
         """The proxy, from setup to shutdown.
 
         Raises:
-            UsageError: before or after these.
+            UsageError: the behaviour is not set up.
         """
         if self._proxy is None:
-            raise UsageError(f"{self.qualified_name} was not set up: tree.setup(session=session)")
+            raise UsageError(
+                f"{self.qualified_name} is not set up: call tree.setup(session=session)"
+            )
         return self._proxy
 
 
-class CallService(ServiceBehaviour):
-    """Calls a service once in each run: RUNNING until the answer is there.
+class CallService(ServiceBehaviour[RequestT, ResponseT]):
+    """Calls a service once in each run. It is RUNNING until the response arrives.
 
-    SUCCESS with the answer; FAILURE where the call failed, the deadline passed, or the request
-    was not to be had. Interrupted, it cancels the call. A new run never sees an older answer: it
-    unsets the blackboard's response and error before it calls.
+    It ends with SUCCESS if the call is answered, and with FAILURE if the call fails or if there is
+    no request. If it is interrupted, it cancels the call. A new run never sees an older response:
+    it unsets the blackboard's response and error before it calls.
 
     Args:
-        name: of the behaviour.
+        name: the name of the behaviour.
         srv_type: a service class or its name, ``"std_srvs/srv/SetBool"``.
         srv_name: the service's name.
         request: a message, a mapping of its fields, or None for an empty one; or a function that
             returns one of these, called at the beginning of each run.
-        key_request: the blackboard variable to take the request from, in place of ``request``; may
-            be nested (``goal.request``).
+        key_request: the blackboard variable to take the request from, instead of ``request``; it
+            may be nested (``goal.request``).
         key_response: the blackboard variable for the response.
-        key_error: the blackboard variable for the exception a run failed with.
+        key_error: the blackboard variable for the exception of a failed run.
         key_feedback_message: the blackboard variable for the feedback message.
-        on_response: takes the response, and may return the status to end with.
-        on_error: takes the exception, and may return the status to end with.
-        on_feedback: takes the feedback message whenever there is a new one.
-        timeout: seconds for the whole call; None for the session's, ``math.inf`` for no deadline.
-        wait: False to fail at once where no server is there, instead of waiting for one.
+        on_response: called with the response; it may return the status to end with.
+        on_error: called with the exception; it may return the status to end with.
+        on_feedback: called with each new feedback message.
+        timeout: seconds for the whole call; None for no deadline; if left out, the session's.
+        wait: False to fail at once if there is no server.
         qos: a ``QoSProfile``; None for the service default with a history of 1,000.
         session: the session; None to take it from ``tree.setup(session=…)``.
 
     Raises:
-        TypeError: both a request and a key for it.
-        TypeError, ValueError: the timeout is no number, or negative.
+        TypeError: both a request and a key for it are given.
+        TypeError, ValueError: the timeout does not fit.
     """
 
     def __init__(
         self,
         name: str,
-        srv_type: Any,
+        srv_type: ServiceType[RequestT, ResponseT] | str,
         srv_name: str,
-        request: Any = None,
+        request: RequestT
+        | Mapping[str, Any]
+        | Callable[[], RequestT | Mapping[str, Any] | None]
+        | None = None,
         *,
         key_request: str | None = None,
         key_response: str | None = None,
         key_error: str | None = None,
         key_feedback_message: str | None = None,
-        on_response: Callable[[Any], Status | None] | None = None,
+        on_response: Callable[[ResponseT], Status | None] | None = None,
         on_error: Callable[[Exception], Status | None] | None = None,
         on_feedback: Callable[[str], object] | None = None,
-        timeout: float | None = None,
+        timeout: Timeout = ...,
         wait: bool = True,
-        qos: Any = None,
+        qos: QoSProfile | None = None,
         session: Session | None = None,
     ) -> None:
         super().__init__(name, srv_type, srv_name, qos, session)
         if request is not None and key_request is not None:
-            raise TypeError("the request is given, or taken from key_request, not both")
+            raise TypeError("give either a request or a key_request, not both")
         check_timeout(timeout, None)
-        self._request = request
+        self._request: Any = request
         self._timeout = timeout
         self._wait = wait
         self._refusal: Exception | None = None
@@ -157,17 +171,17 @@ class CallService(ServiceBehaviour):
         self._register(Access.WRITE, key_response, key_error, key_feedback_message)
 
     def setup(self, **kwargs: Any) -> None:
-        """Take the session and look at the request, where it is a constant; never blocks.
+        """Take the session, and check a constant request; never blocks.
 
         Raises:
             KeyError: there is no session.
-            TypeError, ValueError: service type, QoS or a constant request do not fit.
+            TypeError, ValueError: the service type, the QoS or a constant request does not fit.
             InvalidServiceName: ROS does not allow the name.
             SessionClosed: the session is closed.
         """
         super().setup(**kwargs)
         if not callable(self._request) and self._key_request is None:
-            self._request = self.proxy.request(self._request)
+            self._request = self.proxy.make_request(self._request)
 
     def initialise(self) -> None:
         """Start the call."""
@@ -188,7 +202,7 @@ class CallService(ServiceBehaviour):
             self._tell(f"calling {self.srv_name}")
 
     def update(self) -> Status:
-        """Look what became of the call."""
+        """Return the status of the call."""
         proxy = self.proxy
         state = proxy.get_state()
         if state is ProxyState.RUNNING:
@@ -202,10 +216,12 @@ class CallService(ServiceBehaviour):
         self._tell(f"{self.srv_name}: aborted")
         return Status.FAILURE
 
-    def _answered(self, response: Any) -> Status:
+    def _answered(self, response: ResponseT | None) -> Status:
         self._tell(f"{self.srv_name} answered")
         self._set(self._key_response, response)
-        status = None if self._on_response is None else self._on_response(response)
+        status = None
+        if self._on_response is not None and response is not None:
+            status = self._on_response(response)
         return Status.SUCCESS if status is None else status
 
     def _failed(self, error: Exception) -> Status:
@@ -235,21 +251,21 @@ class CallService(ServiceBehaviour):
         if "." not in name:
             self.blackboard.unset(name)
             return
-        # An attribute of somebody's object, which may not be there yet.
+        # An attribute of an object that may not exist yet.
         with contextlib.suppress(KeyError):
             self.blackboard.set(name, None)
 
 
-class FromBlackboard(CallService):
+class FromBlackboard(CallService[RequestT, ResponseT]):
     """`CallService` with the request from the blackboard, as in ``py_trees_ros``.
 
-    Where the variable is not there, the run ends in FAILURE.
+    If the variable does not exist, the run ends with FAILURE.
 
     Args:
-        name: of the behaviour.
+        name: the name of the behaviour.
         srv_type: a service class or its name.
         srv_name: the service's name.
-        key_request: the blackboard variable to take the request from; may be nested.
+        key_request: the blackboard variable to take the request from; it may be nested.
         key_response: the blackboard variable for the response.
         options: the other keyword arguments of `CallService`.
     """
@@ -257,7 +273,7 @@ class FromBlackboard(CallService):
     def __init__(
         self,
         name: str,
-        srv_type: Any,
+        srv_type: ServiceType[RequestT, ResponseT] | str,
         srv_name: str,
         key_request: str,
         key_response: str | None = None,
@@ -268,11 +284,11 @@ class FromBlackboard(CallService):
         )
 
 
-class FromConstant(CallService):
+class FromConstant(CallService[RequestT, ResponseT]):
     """`CallService` with a constant request, as in ``py_trees_ros``.
 
     Args:
-        name: of the behaviour.
+        name: the name of the behaviour.
         srv_type: a service class or its name.
         srv_name: the service's name.
         request: a message, a mapping of its fields, or None for an empty one.
@@ -283,50 +299,54 @@ class FromConstant(CallService):
     def __init__(
         self,
         name: str,
-        srv_type: Any,
+        srv_type: ServiceType[RequestT, ResponseT] | str,
         srv_name: str,
-        request: Any,
+        request: RequestT
+        | Mapping[str, Any]
+        | Callable[[], RequestT | Mapping[str, Any] | None]
+        | None,
         key_response: str | None = None,
         **options: Any,
     ) -> None:
         super().__init__(name, srv_type, srv_name, request, key_response=key_response, **options)
 
 
-class WaitForService(ServiceBehaviour):
-    """Waits for a server: RUNNING until one is there, then SUCCESS; FAILURE at the deadline.
+class WaitForService(ServiceBehaviour[Any, Any]):
+    """Waits for a server: RUNNING until there is one, then SUCCESS; FAILURE at the deadline.
 
     Args:
-        name: of the behaviour.
+        name: the name of the behaviour.
         srv_type: a service class or its name.
         srv_name: the service's name.
-        timeout: seconds, None for no deadline.
+        timeout: seconds; None for no deadline, ``...`` for the session's.
         qos: a ``QoSProfile``; None for the service default with a history of 1,000.
         session: the session; None to take it from ``tree.setup(session=…)``.
 
     Raises:
-        TypeError, ValueError: the timeout is no number, or negative.
+        TypeError, ValueError: the timeout does not fit.
     """
 
     def __init__(
         self,
         name: str,
-        srv_type: Any,
+        srv_type: ServiceType[Any, Any] | str,
         srv_name: str,
         *,
-        timeout: float | None = None,
-        qos: Any = None,
+        timeout: Timeout = None,
+        qos: QoSProfile | None = None,
         session: Session | None = None,
     ) -> None:
         super().__init__(name, srv_type, srv_name, qos, session)
-        self._timeout = check_timeout(timeout, None)
+        check_timeout(timeout, None)
+        self._timeout = timeout
 
     def initialise(self) -> None:
-        """Start to wait."""
+        """Start the wait."""
         self.proxy.wait_for_service(self._timeout)
         self.feedback_message = f"waiting for {self.srv_name}"
 
     def update(self) -> Status:
-        """Look whether a server is there."""
+        """Return the status of the wait."""
         proxy = self.proxy
         state = proxy.get_state()
         if state is ProxyState.WAITING:

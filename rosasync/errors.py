@@ -3,22 +3,25 @@
 ::
 
     RosasyncError
-    ├── SessionClosed         you closed it; also what callers still waiting get
-    ├── ContextShutdown       the rclpy context went down under the session
+    ├── SessionClosed         the session was closed, before or during the call
+    ├── ContextShutdown       the rclpy context was shut down, or the node destroyed
     ├── UsageError            (RuntimeError) wrong loop or thread, responding twice
     ├── InvalidServiceName    (ValueError)
-    ├── PoolFull              more callers waiting than Limits.waiting
+    ├── PoolFull              more callers wait than Limits.waiting allows
     └── CallError             .srv_name .srv_type .elapsed
         ├── ServiceUnavailable   (TimeoutError) no server
         ├── QueueTimeout         (TimeoutError) the deadline passed while waiting for a client
         ├── ResponseTimeout      (TimeoutError) sent, and not answered in time
-        └── ServerGone           (ConnectionError) the last server vanished, the request being out
+        └── ServerGone           (ConnectionError) every server vanished before it answered
 
 Besides these, a message of the wrong type is a ``TypeError`` and a value out of range a
 ``ValueError``, both before anything is sent.
 """
 
 from __future__ import annotations
+
+from functools import partial
+from typing import Any
 
 __all__ = [
     "CallError",
@@ -36,31 +39,36 @@ __all__ = [
 
 
 class RosasyncError(Exception):
-    """The root of every error rosasync defines."""
+    """The base of all errors that rosasync defines."""
 
 
 class SessionClosed(RosasyncError):
-    """The session, or the server asked, was closed by its owner."""
+    """The session, or the server, has been closed."""
 
 
 class ContextShutdown(RosasyncError):
-    """The rclpy context, or a borrowed node, went down under the session."""
+    """The rclpy context was shut down, or the session's node destroyed."""
+
+    def __init__(
+        self, message: str = "the rclpy context was shut down, or the node destroyed"
+    ) -> None:
+        super().__init__(message)
 
 
 class UsageError(RosasyncError, RuntimeError):
-    """A call from the wrong loop or thread, or one that the object's state forbids."""
+    """A call from the wrong loop or thread, or in a state that does not allow it."""
 
 
 class InvalidServiceName(RosasyncError, ValueError):
-    """A service name that ROS does not allow."""
+    """ROS does not allow this service name."""
 
 
 class PoolFull(RosasyncError):
-    """As many callers as ``Limits.waiting`` allows are already queued for the service."""
+    """More callers wait for the service than ``Limits.waiting`` allows."""
 
 
 class CallError(RosasyncError):
-    """A call that was not answered.
+    """A call that was not answered. It can be copied and pickled.
 
     Attributes:
         srv_name: the resolved service name.
@@ -74,18 +82,25 @@ class CallError(RosasyncError):
         self.srv_type = srv_type
         self.elapsed = elapsed
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Exceptions are copied from their positional arguments, and these are keywords.
+        make = partial(
+            type(self), srv_name=self.srv_name, srv_type=self.srv_type, elapsed=self.elapsed
+        )
+        return make, self.args, self.__dict__
+
 
 class ServiceUnavailable(CallError, TimeoutError):
-    """No server is there; the message says what was seen instead."""
+    """There is no server; the message describes what the graph shows instead."""
 
 
 class QueueTimeout(CallError, TimeoutError):
-    """The deadline passed while the caller waited for a client; nothing was sent."""
+    """The deadline passed while the caller waited for a client. Nothing was sent."""
 
 
 class ResponseTimeout(CallError, TimeoutError):
-    """The request was sent and not answered in time; the server may still run it."""
+    """The request was sent and not answered in time. The server may still run it."""
 
 
 class ServerGone(CallError, ConnectionError):
-    """The last server of the service vanished while the request was out."""
+    """Every server that could answer vanished while the request was outstanding."""

@@ -53,6 +53,11 @@ class LoopGateway:
         """Whether the gateway, or the loop, is closed."""
         return self._closed or self.loop.is_closed()
 
+    @property
+    def pending(self) -> int:
+        """The number of operations that are registered and not finished."""
+        return len(self._pending)
+
     def check_open(self) -> None:
         """Raise `SessionClosed` if the gateway, or the loop, is closed."""
         if self.closed:

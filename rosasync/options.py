@@ -1,11 +1,14 @@
-"""Limits, Retry, timeouts, and the checks of their values."""
+"""Limits, Retry, the options of a session, and the checks of their values."""
 
 from __future__ import annotations
 
 import math
+import numbers
+import operator
 from dataclasses import dataclass
-from types import EllipsisType
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal, SupportsFloat, SupportsIndex
+
+from rosasync.typing import Timeout
 
 if TYPE_CHECKING:
     from rclpy.context import Context
@@ -16,77 +19,103 @@ __all__ = [
     "Limits",
     "Retry",
     "SessionOptions",
-    "Timeout",
     "check_count",
+    "check_flag",
+    "check_retry",
     "check_seconds",
     "check_timeout",
 ]
 
-Timeout: TypeAlias = float | EllipsisType | None
-"""Seconds, None for no deadline, ``...`` for the default of whoever is asked."""
 
-
-def check_seconds(name: str, value: float) -> float:
-    """Return ``value`` as a float.
+def check_seconds(name: str, value: SupportsFloat) -> float:
+    """Return ``value``, any real number but a bool, as a float.
 
     Raises:
         TypeError: it is not a number.
-        ValueError: it is negative or not a number (NaN).
+        ValueError: it is negative, not a number (NaN), or too large for a float.
     """
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise TypeError(f"{name} must be a number of seconds, not {type(value).__name__}")
-    if math.isnan(value) or value < 0:
+    number = _as_float(name, value, "a number of seconds")
+    if number < 0:
         raise ValueError(f"{name} must not be negative, got {value!r} seconds")
-    return float(value)
+    return number
 
 
 def check_timeout(value: Timeout, default: float | None) -> float | None:
-    """Return a timeout in seconds, None for no deadline; ``...`` gives ``default``.
+    """Return a timeout in seconds, or None for no deadline; ``...`` gives ``default``.
 
     Raises:
         TypeError: it is not a number.
-        ValueError: it is negative or not a number (NaN).
+        ValueError: it is negative, not a number (NaN), or too large for a float.
     """
     if value is ...:
         return default
     if value is None:
         return None
-    return check_seconds("timeout", value) if value != math.inf else None
+    seconds = check_seconds("timeout", value)
+    return None if seconds == math.inf else seconds
 
 
-def check_count(name: str, value: int, least: int) -> int:
-    """Return ``value``, a whole number of at least ``least``.
+def check_count(name: str, value: SupportsIndex, least: int) -> int:
+    """Return ``value``, any whole number but a bool, as an int of at least ``least``.
 
     Raises:
         TypeError: it is not a whole number.
         ValueError: it is smaller than ``least``.
     """
-    if isinstance(value, bool) or not isinstance(value, int):
+    if isinstance(value, bool) or not isinstance(value, numbers.Integral):
         raise TypeError(f"{name} must be a whole number, not {type(value).__name__}")
-    if value < least:
-        raise ValueError(f"{name} must be at least {least}, got {value}")
-    return value
+    number = operator.index(value)
+    if number < least:
+        raise ValueError(f"{name} must be at least {least}, got {number}")
+    return number
+
+
+def check_flag(name: str, value: object) -> None:
+    """Raise `TypeError` unless ``value`` is a bool."""
+    if not isinstance(value, bool):
+        raise TypeError(f"{name} must be True or False, not {type(value).__name__}")
+
+
+def check_retry(value: object) -> None:
+    """Raise `TypeError` unless ``value`` is a `Retry` or None."""
+    if value is not None and not isinstance(value, Retry):
+        raise TypeError(
+            f"retry must be a rosasync.Retry, such as Retry(attempts=3), not {type(value).__name__}"
+        )
+
+
+def _as_float(name: str, value: SupportsFloat, expected: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, numbers.Real):
+        raise TypeError(f"{name} must be {expected}, not {type(value).__name__}")
+    try:
+        number = float(value)
+    except OverflowError:
+        raise ValueError(f"{name} is too large: use math.inf or None for no limit") from None
+    if math.isnan(number):
+        raise ValueError(f"{name} must be {expected}, not NaN")
+    return number
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
     """What the pool may use for each service.
 
-    The default is one client that carries ten requests at once: the depth of a stock server's
-    queue, past which the middleware drops requests and says nothing. ``Limits(clients=8,
-    in_flight=1)`` claims clients exclusively instead.
+    By default one client carries at most ten requests at once, because a stock server queues ten
+    and silently drops the rest. ``Limits(clients=8, in_flight=1)`` gives each call a client of its
+    own.
 
     Attributes:
-        clients: most rclpy clients for each (url, type).
-        in_flight: most unanswered requests for each client.
-        waiting: most callers queued for each (url, type); ``PoolFull`` beyond it.
+        clients: most rclpy clients for each service.
+        in_flight: most outstanding requests for each client. A request that was cancelled or timed
+            out counts until the server has dealt with it, see ``grace``.
+        waiting: most callers that wait for each service; further callers get `PoolFull`.
         idle: seconds after which an unused client is destroyed.
-        grace: seconds for which an abandoned request (cancelled, timed out) keeps its place in the
-            window, where no late response frees it sooner: it is still in the server's queue.
+        grace: seconds for which a cancelled or timed-out request counts as outstanding, unless its
+            late response arrives sooner. It may still be in the server's queue.
 
     Raises:
-        TypeError: a value of the wrong kind.
-        ValueError: a value out of range.
+        TypeError: a value is not a number.
+        ValueError: a value is out of range.
     """
 
     clients: int = 1
@@ -96,27 +125,27 @@ class Limits:
     grace: float = 5.0
 
     def __post_init__(self) -> None:
-        check_count("clients", self.clients, 1)
-        check_count("in_flight", self.in_flight, 1)
-        check_count("waiting", self.waiting, 0)
-        check_seconds("idle", self.idle)
-        check_seconds("grace", self.grace)
+        _set(self, "clients", check_count("clients", self.clients, 1))
+        _set(self, "in_flight", check_count("in_flight", self.in_flight, 1))
+        _set(self, "waiting", check_count("waiting", self.waiting, 0))
+        _set(self, "idle", check_seconds("idle", self.idle))
+        _set(self, "grace", check_seconds("grace", self.grace))
 
 
 @dataclass(frozen=True, slots=True)
 class Retry:
-    """When to send an unanswered request again: only for services that may run twice.
+    """When to send an unanswered request again; only for services that may run twice.
 
-    The first answer to any attempt wins; the deadline stays the whole call's.
+    The first answer to any attempt wins. The deadline is still that of the whole call.
 
     Attributes:
-        attempts: how often the request is sent at most, the first time included.
+        attempts: how often the request is sent at most, including the first time.
         after: seconds to wait for an answer before the second attempt.
-        backoff: by how much that wait grows with every further attempt.
+        backoff: the factor by which that wait grows with each further attempt.
 
     Raises:
-        TypeError: a value of the wrong kind.
-        ValueError: a value out of range.
+        TypeError: a value is not a number.
+        ValueError: a value is out of range.
     """
 
     attempts: int = 3
@@ -124,9 +153,10 @@ class Retry:
     backoff: float = 2.0
 
     def __post_init__(self) -> None:
-        check_count("attempts", self.attempts, 1)
-        check_seconds("after", self.after)
-        if check_seconds("backoff", self.backoff) < 1:
+        _set(self, "attempts", check_count("attempts", self.attempts, 1))
+        _set(self, "after", check_seconds("after", self.after))
+        _set(self, "backoff", _as_float("backoff", self.backoff, "a number"))
+        if self.backoff < 1:
             raise ValueError(f"backoff must be at least 1, got {self.backoff!r}")
 
 
@@ -144,13 +174,17 @@ class SessionOptions:
     introspection: Literal["off", "metadata", "contents"]
 
     def __post_init__(self) -> None:
+        if self.bridge not in ("auto", "direct", "executor"):
+            raise ValueError(f"bridge must be 'auto', 'direct' or 'executor', not {self.bridge!r}")
         if self.introspection not in ("off", "metadata", "contents"):
             raise ValueError(
                 f"introspection must be 'off', 'metadata' or 'contents', not {self.introspection!r}"
             )
-        if self.bridge not in ("auto", "direct", "executor"):
-            raise ValueError(f"bridge must be 'auto', 'direct' or 'executor', not {self.bridge!r}")
         if not isinstance(self.limits, Limits):
             raise TypeError(f"limits must be a rosasync.Limits, not {type(self.limits).__name__}")
-        object.__setattr__(self, "timeout", check_timeout(self.timeout, None))
-        object.__setattr__(self, "busy_poll", check_seconds("busy_poll", self.busy_poll))
+        _set(self, "timeout", check_timeout(self.timeout, None))
+        _set(self, "busy_poll", check_seconds("busy_poll", self.busy_poll))
+
+
+def _set(frozen: object, name: str, value: object) -> None:
+    object.__setattr__(frozen, name, value)

@@ -205,6 +205,13 @@ class NodePort(Protocol):
     def open_service(self, service: Service, deliver: DeliverRequest) -> ServicePort:
         """Create a service that passes its requests to ``deliver``; raises as `open_client`."""
 
+    def count_servers(self, service: Service) -> int:
+        """Return how many servers have the service's name, whatever their type and QoS. Cheap.
+
+        Raises:
+            ContextShutdown: the node is down.
+        """
+
     def find_servers(self, service: Service) -> frozenset[Hashable]:
         """Identify the servers that fit: by name, type and QoS.
 

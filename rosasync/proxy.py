@@ -1,35 +1,40 @@
-"""AsyncServiceProxy: the tick-driven state machine."""
+"""AsyncServiceProxy: a tick-driven state machine for behaviour trees."""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import enum
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from copy import deepcopy
+from typing import TYPE_CHECKING, Any, Generic, cast
 
-from rosasync.aio import begin
+from rosasync.aio import start_task
 from rosasync.errors import SessionClosed, UsageError
 from rosasync.options import check_timeout
+from rosasync.typing import RequestT, ResponseT, ServiceType, Timeout
 
 if TYPE_CHECKING:
-    from rosasync.portal import Gate
+    from rclpy.qos import QoSProfile
+
     from rosasync.session import Session
 
 __all__ = ["AsyncServiceProxy", "ProxyState"]
 
 
 class ProxyState(enum.Enum):
-    """What became of the last thing an `AsyncServiceProxy` was asked for.
+    """The state of the last operation of an `AsyncServiceProxy`.
 
     Attributes:
-        IDLE: nothing was asked yet, or the response has been read.
-        WAITING: for a server to be there.
-        SERVICE_AVAILABLE: a server was there at the end of the wait.
-        RUNNING: a call is under way: waiting for a server, a client or the response.
-        RESPONSE_READY: the response is there to be read.
-        TIMEOUT: the deadline passed, of the call or the wait, in any phase.
-        ABORTED: stopped before its end, or before its response was read.
-        ERROR: it failed otherwise; `AsyncServiceProxy.get_errors` tells how.
+        IDLE: there was none yet, or its response has been read.
+        WAITING: it waits for a server.
+        SERVICE_AVAILABLE: it waited for a server, and there is one.
+        RUNNING: a call is in progress: waiting for a server, a client or the response.
+        RESPONSE_READY: the response can be read.
+        TIMEOUT: the deadline of the call or the wait passed, in any phase.
+        ABORTED: it was stopped before its end, or before its response was read.
+        ERROR: it failed otherwise; `AsyncServiceProxy.get_errors` says how.
     """
 
     IDLE = enum.auto()
@@ -43,35 +48,35 @@ class ProxyState(enum.Enum):
 
 
 PENDING = (ProxyState.WAITING, ProxyState.RUNNING)
-"""The loop is at work on it."""
+"""The loop works on the operation."""
 
 STOPPABLE = (*PENDING, ProxyState.RESPONSE_READY)
-"""Something is under way, or unread."""
+"""Something is in progress, or unread."""
 
 
-class AsyncServiceProxy:
+class AsyncServiceProxy(Generic[RequestT, ResponseT]):
     """Calls a service from the ticks of a behaviour tree.
 
-    No method blocks, and each may be called from the loop and from any other thread. It owns
+    No method blocks, and each may be called from the loop and from any other thread. A proxy owns
     nothing: all proxies of a session share its clients through the pool.
 
     ::
 
         state              call_service  wait_for_service  stop_call  get_response
-        IDLE               RUNNING       WAITING           stays      None
+        IDLE               RUNNING       WAITING           unchanged  None
         WAITING            RUNNING       WAITING           ABORTED    None
-        SERVICE_AVAILABLE  RUNNING       WAITING           stays      None
+        SERVICE_AVAILABLE  RUNNING       WAITING           unchanged  None
         RUNNING            RUNNING       WAITING           ABORTED    None
         RESPONSE_READY     RUNNING       WAITING           ABORTED    response; IDLE
-        TIMEOUT            RUNNING       WAITING           stays      None
-        ABORTED            RUNNING       WAITING           stays      None
-        ERROR              RUNNING       WAITING           stays      None
+        TIMEOUT            RUNNING       WAITING           unchanged  None
+        ABORTED            RUNNING       WAITING           unchanged  None
+        ERROR              RUNNING       WAITING           unchanged  None
 
-    By itself only WAITING changes, to SERVICE_AVAILABLE, TIMEOUT or ERROR; and RUNNING, to
-    RESPONSE_READY, TIMEOUT or ERROR. ERROR is also what becomes of both when the session is closed.
+    Two states change by themselves: WAITING to SERVICE_AVAILABLE, TIMEOUT or ERROR, and RUNNING to
+    RESPONSE_READY, TIMEOUT or ERROR. When the session is closed, both become ERROR.
 
-    A new call or wait replaces what was asked before: that is cancelled, and whatever still comes
-    of it is counted as late and never shown. ``shutdown`` does what ``stop_call`` does, for good.
+    A new call or wait replaces the previous operation, which is cancelled. A late response to that
+    is counted and never shown. ``shutdown`` does what ``stop_call`` does, for good.
 
     Args:
         session: an open session.
@@ -80,177 +85,209 @@ class AsyncServiceProxy:
         qos: a ``QoSProfile``; None for the service default with a history of 1,000.
 
     Raises:
-        TypeError, ValueError: there is no such service type, or that is no QoS.
+        TypeError, ValueError: the service type does not exist, or the QoS is not a ``QoSProfile``.
         InvalidServiceName: ROS does not allow the name.
         UsageError: the session is not open yet.
         SessionClosed: the session is closed.
     """
 
-    # One attribute, swapped as a whole, says what is wanted; the loop writes only into the object
-    # it works on. So no lock is needed, and a superseded call has no way to show up. Each swap is
-    # followed by a look of the loop at what is wanted then: the last look settles it.
-    __slots__ = ("__weakref__", "_closed", "_gate", "_now", "_service", "_srv_class", "_working")
+    # `_operation` says what is wanted, and is replaced as a whole. The loop writes only into the
+    # operation it works on. So no lock is needed, and a replaced call cannot show up. After each
+    # replacement the loop reconciles: the last time settles what it works on.
+    __slots__ = (
+        "__weakref__",
+        "_arguments",
+        "_closed",
+        "_gateway",
+        "_operation",
+        "_pool",
+        "_service",
+        "_timeout",
+        "_working",
+    )
 
-    def __init__(self, session: Session, srv_type: Any, srv_name: str, *, qos: Any = None) -> None:
-        self._gate: Gate = session._open_core().gate
-        self._srv_class = self._gate.check_service(srv_type, srv_name, qos)
-        self._service = (srv_type, srv_name, qos)
-        self._now = _Ask(ProxyState.IDLE)
-        self._working: _Ask | None = None
+    def __init__(
+        self,
+        session: Session,
+        srv_type: ServiceType[RequestT, ResponseT] | str,
+        srv_name: str,
+        *,
+        qos: QoSProfile | None = None,
+    ) -> None:
+        core = session.core
+        core.gateway.check_open()
+        self._gateway = core.gateway
+        self._pool = core.pool
+        self._arguments = core.arguments
+        self._timeout = core.timeout
+        self._service = core.arguments.service(srv_type, srv_name, qos)
+        self._operation = _Operation(ProxyState.IDLE)
+        self._working: _Operation | None = None
         self._closed = False
 
     def __repr__(self) -> str:
-        return f"<AsyncServiceProxy {self._service[1]} {self.get_state().name}>"
+        return f"<AsyncServiceProxy {self._service.key.srv_name} {self.get_state().name}>"
 
     def call_service(
-        self, request: Any = None, timeout: float | None = None, *, wait: bool = True
+        self,
+        request: RequestT | Mapping[str, Any] | None = None,
+        timeout: Timeout = ...,
+        *,
+        wait: bool = True,
     ) -> None:
-        """Start a call in place of whatever was asked before; the state is RUNNING.
+        """Start a call, which replaces the previous operation. The state becomes RUNNING.
 
-        On the loop's thread the request is sent at once, if a client is free.
+        On the loop's thread the request is sent at once if a client is free. Otherwise it is
+        copied. So it may be changed afterwards.
 
         Args:
-            request: a message, a mapping of its fields, or None for an empty one. The loop sends
-                it: do not change it before the answer.
-            timeout: seconds for the whole call from now on; None for the session's, ``math.inf``
-                for no deadline.
-            wait: False to fail at once where no server is there.
+            request: a message, a mapping of its fields, or None for an empty one.
+            timeout: seconds for the whole call, from now on; None for no deadline; if left out, the
+                session's.
+            wait: False to fail at once if there is no server.
 
         Raises:
-            TypeError, ValueError: the request or the timeout does not fit; the state stays.
+            TypeError, ValueError: an argument does not fit; the state is unchanged.
             UsageError: the proxy was shut down.
         """
-        message = self.request(request)
-        seconds = self._gate.timeout if timeout is None else check_timeout(timeout, None)
-        self._ask(_Ask(ProxyState.RUNNING, message, seconds, wait))
+        message, seconds = self._arguments.call(
+            self._service, request, timeout, self._timeout, wait
+        )
+        if request is not None and not self._gateway.on_loop:
+            message = deepcopy(message)
+        self._start(_Operation(ProxyState.RUNNING, message, seconds, wait))
 
-    def request(self, request: Any) -> Any:
-        """Return the message that `call_service` makes of this, to make it ahead.
+    def make_request(self, request: RequestT | Mapping[str, Any] | None) -> RequestT:
+        """Return the message that `call_service` sends for this argument, to prepare it in advance.
 
         Raises:
             TypeError, ValueError: it does not fit.
         """
-        return self._gate.request(self._srv_class, request)
+        message, _ = self._arguments.call(self._service, request, None, None)
+        return cast(RequestT, message)
 
-    def wait_for_service(self, timeout: float | None = None) -> None:
-        """Start to wait for a server in place of whatever was asked before; the state is WAITING.
+    def wait_for_service(self, timeout: Timeout = None) -> None:
+        """Wait for a server, which replaces the previous operation. The state becomes WAITING.
 
         Args:
-            timeout: seconds from now on; None for no deadline.
+            timeout: seconds from now on; None for no deadline, ``...`` for the session's.
 
         Raises:
-            TypeError, ValueError: the timeout is no number, or negative; the state stays.
+            TypeError, ValueError: the timeout does not fit; the state is unchanged.
             UsageError: the proxy was shut down.
         """
-        self._ask(_Ask(ProxyState.WAITING, timeout=check_timeout(timeout, None)))
+        seconds = check_timeout(timeout, self._timeout)
+        self._start(_Operation(ProxyState.WAITING, timeout=seconds))
 
     def stop_call(self) -> None:
-        """Give up what was asked for, in any state.
+        """Stop the operation, in any state.
 
-        What is under way is cancelled and an unread response dropped: the state is ABORTED,
-        whatever still comes. Where nothing is under way or unread, the state stays.
+        What is in progress is cancelled, and an unread response dropped: the state becomes ABORTED.
+        Otherwise it is unchanged.
         """
-        if self._now.state in STOPPABLE:
-            self._swap(_Ask(ProxyState.ABORTED))
+        if self._operation.state in STOPPABLE:
+            self._replace(_Operation(ProxyState.ABORTED))
 
     def get_state(self) -> ProxyState:
-        """Return the state: an attribute's value, no more."""
-        return self._now.state
+        """Return the state. This only reads an attribute."""
+        return self._operation.state
 
-    def get_response(self) -> Any:
-        """Return the response where one is ready, once: the state becomes IDLE. Else None."""
-        now = self._now
-        if now.state is not ProxyState.RESPONSE_READY:
+    def get_response(self) -> ResponseT | None:
+        """Return the response once, and become IDLE. Return None if there is none to read."""
+        operation = self._operation
+        if operation.state is not ProxyState.RESPONSE_READY:
             return None
-        # The loop has done with it.
-        now.state = ProxyState.IDLE
-        response, now.response = now.response, None
-        return response
+        # The loop has finished with it.
+        operation.state = ProxyState.IDLE
+        response, operation.response = operation.response, None
+        return cast(ResponseT, response)
 
     def get_errors(self) -> list[Exception]:
-        """Return what went wrong, where the state is TIMEOUT or ERROR; else an empty list."""
-        error = self._now.error
+        """Return the error in the states TIMEOUT and ERROR; otherwise an empty list."""
+        error = self._operation.error
         return [] if error is None else [error]
 
     def shutdown(self) -> None:
-        """Stop the call, and refuse others; idempotent."""
+        """Stop the call, and refuse further ones; idempotent."""
         self._closed = True
         self.stop_call()
 
-    def _ask(self, ask: _Ask) -> None:
+    def _start(self, operation: _Operation) -> None:
         if self._closed:
-            raise UsageError(f"{self._service[1]}: the proxy was shut down")
-        self._swap(ask)
+            raise UsageError(f"{self._service.key.srv_name}: the proxy was shut down")
+        self._replace(operation)
         if self._closed:
-            # Shut down by another thread meanwhile.
+            # Another thread has shut it down in between.
             self.stop_call()
 
-    def _swap(self, ask: _Ask) -> None:
-        before, self._now = self._now, ask
-        gate = self._gate
-        gate.finished(before)
-        if ask.state not in PENDING:
-            gate.tell(self._look)
+    def _replace(self, operation: _Operation) -> None:
+        before, self._operation = self._operation, operation
+        gateway = self._gateway
+        gateway.discard(before)
+        if operation.state not in PENDING:
+            with contextlib.suppress(SessionClosed):
+                gateway.call(self._reconcile)
             return
+        gateway.register(operation)
         try:
-            gate.post(ask, self._look)
+            gateway.call(self._reconcile)
         except SessionClosed as error:
-            ask.fail(error)
+            gateway.discard(operation)
+            operation.fail(error)
 
     # On the loop's thread.
 
-    def _look(self) -> None:
-        """Drop what is not wanted any more, and start what is."""
-        now = self._now
-        working = self._working
-        if now is working:
+    def _reconcile(self) -> None:
+        """Cancel the work that is not wanted any more, and start what is wanted."""
+        operation, working = self._operation, self._working
+        if operation is working:
             return
-        loop = self._gate.loop
         if working is not None and working.task is not None:
-            loop.call_soon(working.task.cancel)
+            working.task.cancel()
         self._working = None
-        if now.state in PENDING and not now.begun:
-            now.begun = True
-            self._working = now
-            work = self._work(now)
-            # A call is sent by the tick that asks for it; a wait is always WAITING at first.
-            calls = now.state is ProxyState.RUNNING
-            now.task = begin(loop, work) if calls else loop.create_task(work)
+        if operation.state in PENDING and not operation.begun:
+            operation.begun = True
+            self._working = operation
+            loop, work = self._gateway.loop, self._work(operation)
+            # The tick that asks for a call sends it. A wait is always WAITING at first.
+            calls = operation.state is ProxyState.RUNNING
+            operation.task = start_task(loop, work) if calls else loop.create_task(work)
 
-    async def _work(self, ask: _Ask) -> None:
+    async def _work(self, operation: _Operation) -> None:
         try:
-            ask.end(*await self._do(ask))
+            operation.end(*await self._perform(operation))
         except TimeoutError as error:
-            ask.end(ProxyState.TIMEOUT, error=error)
+            operation.end(ProxyState.TIMEOUT, error=error)
         except asyncio.CancelledError:
-            ask.end(ProxyState.ABORTED)
+            operation.end(ProxyState.ABORTED)
             raise
         except Exception as error:
-            ask.fail(error)
+            operation.fail(error)
         finally:
-            self._gate.finished(ask)
-            if self._working is ask:
+            self._gateway.discard(operation)
+            if self._working is operation:
                 self._working = None
 
-    async def _do(self, ask: _Ask) -> tuple[ProxyState, Any]:
-        pool = self._gate.pool
-        endpoint = pool.endpoint(*self._service)
-        if ask.state is ProxyState.WAITING:
-            await pool.wait_for_server(endpoint, ask.left())
+    async def _perform(self, operation: _Operation) -> tuple[ProxyState, Any]:
+        service = self._pool.service_of(self._service)
+        if operation.state is ProxyState.WAITING:
+            await service.wait_for_server(operation.time_left())
             return ProxyState.SERVICE_AVAILABLE, None
-        response = await pool.call(endpoint, ask.request, ask.left(), ask.wait)
+        response = await service.call(
+            operation.request, operation.time_left(), operation.wait, copy=True
+        )
         return ProxyState.RESPONSE_READY, response
 
 
-class _Ask:
-    """One thing a proxy is asked for: a call, a wait, or nothing."""
+class _Operation:
+    """One operation of a proxy: a call, a wait, or none."""
 
     __slots__ = (
-        "asked",
         "begun",
         "error",
         "request",
         "response",
+        "started",
         "state",
         "task",
         "timeout",
@@ -268,25 +305,25 @@ class _Ask:
         self.request = request
         self.timeout = timeout
         self.wait = wait
-        self.asked = time.monotonic()
+        self.started = time.monotonic()
         self.begun = False
         self.response: Any = None
         self.error: Exception | None = None
         self.task: asyncio.Task[None] | None = None
 
-    def left(self) -> float | None:
-        """Seconds of the timeout that are left."""
+    def time_left(self) -> float | None:
+        """Return the seconds that are left of the timeout."""
         if self.timeout is None:
             return None
-        return max(0.0, self.timeout - (time.monotonic() - self.asked))
+        return max(0.0, self.timeout - (time.monotonic() - self.started))
 
     def end(self, state: ProxyState, response: Any = None, error: Exception | None = None) -> None:
-        """Take the outcome, if there is none yet; the state last, since others look at it."""
+        """Set the outcome, unless there is one; the state last, because other threads read it."""
         if self.state in PENDING:
             self.response = response
             self.error = error
             self.state = state
 
     def fail(self, error: Exception) -> None:
-        """End in an error, unless it has ended already."""
+        """End with an error, unless it has ended already."""
         self.end(ProxyState.ERROR, error=error)

@@ -1,75 +1,70 @@
-"""Session: node, executor thread, pool and servers under one lifetime."""
+"""Session: node, executor thread, client pool and servers under one lifetime."""
 
 from __future__ import annotations
 
 import asyncio
-import atexit
 import importlib
-import logging
-import warnings
-import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Generic, Literal, Self, overload
 
-import anyio
-
-from rosasync.aio import until_done
-from rosasync.errors import SessionClosed, UsageError
-from rosasync.gateway import LoopGateway
-from rosasync.options import Limits, Retry, SessionOptions, Timeout, check_timeout
-from rosasync.pool import ClientPool, Endpoint, context_shut_down
-from rosasync.portal import Gate, Portal
-from rosasync.server import Handler, ServiceServer
+from rosasync.aio import start_task
+from rosasync.core import Core, session_closed
+from rosasync.errors import UsageError
+from rosasync.options import Limits, Retry, SessionOptions, check_timeout
 from rosasync.statistics import SessionStatistics
+from rosasync.typing import RequestT, ResponseT, ServiceType, Timeout
 
 if TYPE_CHECKING:
     from rclpy.context import Context
     from rclpy.executors import Executor
     from rclpy.node import Node
+    from rclpy.qos import QoSProfile
 
+    from rosasync.gateway import LoopGateway
+    from rosasync.handlers import ErrorHook, Handler, OverloadHook
+    from rosasync.pool import ClientPool
+    from rosasync.portal import Portal
     from rosasync.ports import NodePort
     from rosasync.ros.node import RosNode
+    from rosasync.server import ServiceServer
+    from rosasync.service_pool import ServicePool
 
 __all__ = ["ServiceClient", "Session"]
 
-logger = logging.getLogger("rosasync")
-
-ENDING = 5.0
-"""Seconds for a callback of the node to end with the session, before its thread is left behind."""
-
 
 class Session:
-    """Calls ROS 2 services from asyncio.
+    """Calls and serves ROS 2 services from asyncio.
 
     ::
 
         async with rosasync.Session("my_app") as session:
             response = await session.call(SetBool, "/arm/enable", {"data": True}, timeout=2.0)
 
-    It belongs to the loop it is opened in, and is used on that loop's thread. It may be opened in
-    one task and closed in another.
+    A session belongs to the loop in which it is opened. Use it on that loop's thread; other threads
+    use ``session.from_thread``. It may be opened in one task and closed in another.
 
     Args:
         node: a name, for a node and a context of the session's own, which end with it; or an
-            ``rclpy.node.Node``, which is borrowed: never destroyed, and spun only if no executor
-            has it yet. rclpy's signal handlers are not installed.
-        context: for a named node, the ``rclpy.context.Context`` to make it in; not shut down.
-        executor: an ``rclpy.executors.Executor`` that you spin: the node is added to it, and the
+            ``rclpy.node.Node``, which is borrowed: it is never destroyed, and spun only if no
+            executor has it yet. The session does not install rclpy's signal handlers.
+        context: for a named node, the ``rclpy.context.Context`` to create it in. The session does
+            not shut it down.
+        executor: an ``rclpy.executors.Executor`` that you spin. The node is added to it, and the
             session starts no thread.
         bridge: how responses reach the loop: ``"direct"``, ``"executor"``, or ``"auto"`` for the
-            direct one where it works.
+            direct bridge if it works here.
         limits: what the pool may use for each service.
-        timeout: seconds for a call that does not say, None for no deadline.
-        busy_poll: seconds for which the loop looks for a response before it sleeps, after Linux's
-            SO_BUSY_POLL: about half the latency, for a core that is busy as long as a quick
-            service is called. 0.0005 suits services on this machine. Only on the direct bridge.
-        introspection: what clients and servers publish of every call, on
+        timeout: seconds for a call that gives no timeout, None for no deadline.
+        busy_poll: seconds for which the loop looks for a response before it sleeps, as Linux's
+            SO_BUSY_POLL. It halves the latency, and keeps a core busy while a quick service is
+            called. 0.0005 suits services on the same machine. Only on the direct bridge.
+        introspection: what clients and servers publish about each call, on
             ``<service>/_service_event``: ``"off"``, ``"metadata"`` (that it happened) or
-            ``"contents"`` (request and response too).
+            ``"contents"`` (with request and response).
 
     Raises:
-        TypeError, ValueError: an argument is of the wrong kind, or out of range.
+        TypeError, ValueError: an argument is of the wrong type, or out of range.
     """
 
     def __init__(
@@ -94,27 +89,30 @@ class Session:
             busy_poll=busy_poll,
             introspection=introspection,
         )
-        self._timeout = self._options.timeout
-        self._core: _Core | None = None
+        self._core: Core | None = None
+        # Closed without having been opened; afterwards the core knows.
         self._closed = False
 
     def __repr__(self) -> str:
-        if self._core is None:
+        core = self._core
+        if core is None:
             return f"<Session {self._options.node!r} not open>"
-        state = "closed" if self._closed else f"{self.bridge} bridge, {self._core.pool!r}"
-        return f"<Session {self._core.name!r} {state}>"
+        state = "closed" if core.closed else f"{core.node.bridge} bridge, {core.pool!r}"
+        return f"<Session {core.name!r} {state}>"
 
     async def __aenter__(self) -> Self:
         """Open the session in the running loop.
 
         Raises:
             ImportError: rclpy is not installed; the message says how to install it.
-            UsageError: it was opened before, or the bridge asked for does not work here.
+            UsageError: the session was opened before, or the bridge asked for does not work here.
             TypeError: ``node`` is neither a name nor an rclpy node.
+            ValueError: ROS does not allow the node's name.
+            OSError: the process is out of file descriptors or threads.
         """
         if self._core is not None or self._closed:
-            raise UsageError("a session is opened once")
-        self._core = _Core(self)
+            raise UsageError("a session can be opened only once: create a new one")
+        self._core = Core(self, self._options, self._open_node)
         return self
 
     async def __aexit__(
@@ -127,43 +125,75 @@ class Session:
 
     def __del__(self) -> None:
         core = getattr(self, "_core", None)
-        if core is not None and not self._closed:
-            _warn_unclosed(self)
-            core.abandon()
+        if core is not None and not core.closed:
+            core.abandon(self)
 
     @property
     def closed(self) -> bool:
-        """Whether the session has been closed, or its closing has begun."""
-        return self._closed
+        """Whether the session has been closed, or has begun to close."""
+        return self._closed if self._core is None else self._core.closed
 
     @property
     def bridge(self) -> str:
         """The bridge in use: ``"direct"`` or ``"executor"``."""
-        return self._open_core().ros.bridge
+        return self.core.node.bridge
 
     @property
     def node(self) -> Node:
-        """The rclpy node: for its timers, publishers, parameters and so on."""
-        return self._open_core().ros.node
+        """The rclpy node, for its timers, publishers, parameters and so on."""
+        return self.core.node.node
 
     @property
     def pool(self) -> ClientPool:
-        """The clients."""
-        return self._open_core().pool
+        """The client pool."""
+        return self.core.pool
 
     @property
     def from_thread(self) -> Portal:
         """Calls from other threads than the loop's."""
-        return self._open_core().portal
+        return self.core.portal
+
+    @property
+    def core(self) -> Core:
+        """The parts of the open session, for rosasync itself. Not part of the public API."""
+        if self._core is None:
+            raise _not_open()
+        return self._core
 
     def statistics(self) -> SessionStatistics:
-        """Take a snapshot of how the session stands; after the close, of how it ended."""
-        core = self._open_core()
+        """Take a snapshot of the session's statistics; after the close, of the last ones."""
+        core = self.core
         return SessionStatistics(
-            bridge=core.ros.bridge,
+            bridge=core.node.bridge,
             pool=core.pool.statistics(),
             servers=tuple(server.statistics() for server in core.servers),
         )
+
+    @overload
+    async def call(
+        self,
+        srv_type: ServiceType[RequestT, ResponseT],
+        srv_name: str,
+        request: RequestT | Mapping[str, Any] | None = None,
+        *,
+        timeout: Timeout = ...,
+        qos: QoSProfile | None = None,
+        wait: bool = True,
+        retry: Retry | None = None,
+    ) -> ResponseT: ...
+
+    @overload
+    async def call(
+        self,
+        srv_type: str,
+        srv_name: str,
+        request: Any = None,
+        *,
+        timeout: Timeout = ...,
+        qos: QoSProfile | None = None,
+        wait: bool = True,
+        retry: Retry | None = None,
+    ) -> Any: ...
 
     async def call(
         self,
@@ -172,41 +202,69 @@ class Session:
         request: Any = None,
         *,
         timeout: Timeout = ...,
-        qos: Any = None,
+        qos: QoSProfile | None = None,
         wait: bool = True,
         retry: Retry | None = None,
     ) -> Any:
         """Call a service and return its response.
 
         Args:
-            srv_type: a service class or its name, ``"std_srvs/srv/SetBool"``.
-            srv_name: the service's name; relative, private (``~/name``) and remapped names work
-                as in rclpy.
+            srv_type: a service class or its name, ``"std_srvs/srv/SetBool"``. With a class, type
+                checkers know the response.
+            srv_name: the service's name. Relative, private (``~/name``) and remapped names work as
+                in rclpy.
             request: a message of the request type, a mapping of its fields, or None for an empty
-                one.
-            timeout: seconds for the whole call, None for no deadline; the session's where it is
-                left out.
+                one. It is read when it is sent: do not change it before the response.
+            timeout: seconds for the whole call, None for no deadline; if left out, the session's.
             qos: a ``QoSProfile``; None for the service default with a history of 1,000.
-            wait: False to fail at once where no server is there.
-            retry: when to send again what is unanswered; only for services that may run twice.
-                The request is sent as it then is: it must not be changed before the answer.
+            wait: False to fail at once if there is no server.
+            retry: when to send an unanswered request again; only for services that may run twice.
 
         Raises:
-            ServiceUnavailable: no server was there in time.
+            ServiceUnavailable: there was no server in time.
             QueueTimeout: the deadline passed while waiting for a client; nothing was sent.
-            ResponseTimeout: sent, and not answered in time.
-            ServerGone: the last server vanished while the request was out.
-            PoolFull: as many callers as ``Limits.waiting`` allows are waiting already.
+            ResponseTimeout: the request was sent, and not answered in time.
+            ServerGone: every server vanished while the request was outstanding.
+            PoolFull: more callers wait than `Limits.waiting` allows.
             SessionClosed, ContextShutdown: the session ended, before or during the call.
             InvalidServiceName: ROS does not allow the name.
-            TypeError, ValueError: type, request or timeout do not fit; nothing was sent.
+            TypeError, ValueError: an argument does not fit; nothing was sent.
             UsageError: called from another loop or thread.
         """
-        pool = self._use().pool
-        endpoint = pool.endpoint(srv_type, srv_name, qos)
-        message = pool.request(endpoint, request)
-        seconds = self._timeout if timeout is ... else check_timeout(timeout, None)
-        return await pool.call(endpoint, message, seconds, wait, retry)
+        # As _use does, without the price of another call.
+        core = self._core or self._use()
+        core.check_loop()
+        service = core.pool.service(srv_type, srv_name, qos)
+        message, seconds = core.arguments.call(
+            service.service, request, timeout, core.timeout, wait, retry
+        )
+        return await service.call(message, seconds, wait, retry)
+
+    @overload
+    def start(
+        self,
+        srv_type: ServiceType[RequestT, ResponseT],
+        srv_name: str,
+        request: RequestT | Mapping[str, Any] | None = None,
+        *,
+        timeout: Timeout = ...,
+        qos: QoSProfile | None = None,
+        wait: bool = True,
+        retry: Retry | None = None,
+    ) -> asyncio.Task[ResponseT]: ...
+
+    @overload
+    def start(
+        self,
+        srv_type: str,
+        srv_name: str,
+        request: Any = None,
+        *,
+        timeout: Timeout = ...,
+        qos: QoSProfile | None = None,
+        wait: bool = True,
+        retry: Retry | None = None,
+    ) -> asyncio.Task[Any]: ...
 
     def start(
         self,
@@ -215,74 +273,144 @@ class Session:
         request: Any = None,
         *,
         timeout: Timeout = ...,
-        qos: Any = None,
+        qos: QoSProfile | None = None,
         wait: bool = True,
         retry: Retry | None = None,
     ) -> asyncio.Task[Any]:
-        """Start the same call as a task: what a tick polls and cancels.
+        """Start the same call as a task, for a tick to poll and cancel.
 
-        For the arguments and errors, see `call`. What is wrong with the arguments is raised here,
-        what goes wrong later by the task.
+        If a client is free, the request is sent before this returns. Otherwise it is copied first.
+        So it may be changed afterwards.
+
+        For the arguments and errors, see `call`. Wrong arguments raise here, everything later is
+        raised by the task.
         """
-        pool = self._use().pool
-        endpoint = pool.endpoint(srv_type, srv_name, qos)
-        message = pool.request(endpoint, request)
-        seconds = check_timeout(timeout, self._timeout)
-        return self._loop.create_task(pool.call(endpoint, message, seconds, wait, retry))
+        core = self._use()
+        service = core.pool.service(srv_type, srv_name, qos)
+        message, seconds = core.arguments.call(
+            service.service, request, timeout, core.timeout, wait, retry
+        )
+        call = service.call(message, seconds, wait, retry, copy=request is not None)
+        return start_task(core.loop, call)
+
+    @overload
+    def client(
+        self,
+        srv_type: ServiceType[RequestT, ResponseT],
+        srv_name: str,
+        *,
+        timeout: Timeout = ...,
+        qos: QoSProfile | None = None,
+    ) -> ServiceClient[RequestT, ResponseT]: ...
+
+    @overload
+    def client(
+        self,
+        srv_type: str,
+        srv_name: str,
+        *,
+        timeout: Timeout = ...,
+        qos: QoSProfile | None = None,
+    ) -> ServiceClient[Any, Any]: ...
 
     def client(
-        self, srv_type: Any, srv_name: str, *, timeout: Timeout = ..., qos: Any = None
-    ) -> ServiceClient:
-        """Bind type and name, for several calls. The handle owns nothing: the pool does.
+        self,
+        srv_type: Any,
+        srv_name: str,
+        *,
+        timeout: Timeout = ...,
+        qos: QoSProfile | None = None,
+    ) -> ServiceClient[Any, Any]:
+        """Bind a type and a name, for several calls. The handle owns nothing: the pool does.
 
         Raises:
             InvalidServiceName: ROS does not allow the name.
             TypeError, ValueError: type, QoS or timeout do not fit.
-            SessionClosed: the session is closed.
+            SessionClosed, ContextShutdown: the session has ended.
         """
-        endpoint = self._use().pool.endpoint(srv_type, srv_name, qos)
-        return ServiceClient(self, endpoint, check_timeout(timeout, self._timeout))
+        core = self._use()
+        service = core.pool.service(srv_type, srv_name, qos)
+        return ServiceClient(core, service, check_timeout(timeout, core.timeout))
 
     async def wait_for_service(
-        self, srv_type: Any, srv_name: str, *, timeout: float | None = None, qos: Any = None
+        self,
+        srv_type: ServiceType[Any, Any] | str,
+        srv_name: str,
+        *,
+        timeout: Timeout = None,
+        qos: QoSProfile | None = None,
     ) -> None:
         """Wait until a server of this service is matched.
 
         Args:
             srv_type: a service class or its name.
             srv_name: the service's name.
-            timeout: seconds, None for no deadline.
+            timeout: seconds, None for no deadline, ``...`` for the session's.
             qos: as for `call`.
 
         Raises:
-            ServiceUnavailable: none was there in time; the message says what was seen instead.
-            SessionClosed, ContextShutdown: the session ended meanwhile.
+            ServiceUnavailable: there was none in time; the message describes what the graph shows
+                instead.
+            SessionClosed, ContextShutdown: the session ended.
         """
-        pool = self._use().pool
-        endpoint = pool.endpoint(srv_type, srv_name, qos)
-        await pool.wait_for_server(endpoint, check_timeout(timeout, None))
+        core = self._use()
+        service = core.pool.service(srv_type, srv_name, qos)
+        await service.wait_for_server(check_timeout(timeout, core.timeout))
 
-    def service_is_ready(self, srv_type: Any, srv_name: str, *, qos: Any = None) -> bool:
-        """Tell whether a server of this service is matched, so that a call would be sent at once.
+    def service_is_ready(
+        self,
+        srv_type: ServiceType[Any, Any] | str,
+        srv_name: str,
+        *,
+        qos: QoSProfile | None = None,
+    ) -> bool:
+        """Return whether a server of this service is matched, so that a call is sent at once.
 
-        A service asked for the first time needs some milliseconds to be matched.
+        A service that is asked for the first time takes some milliseconds to be matched.
         """
-        pool = self._use().pool
-        return pool.is_ready(pool.endpoint(srv_type, srv_name, qos))
+        return self._use().pool.service(srv_type, srv_name, qos).is_ready()
+
+    @overload
+    def serve(
+        self,
+        srv_type: ServiceType[RequestT, ResponseT],
+        srv_name: str,
+        handler: Handler[RequestT, ResponseT] | None = None,
+        *,
+        concurrency: int = 100,
+        backlog: int = 1000,
+        qos: QoSProfile | None = None,
+        on_error: ErrorHook[RequestT, ResponseT] | None = None,
+        on_overload: OverloadHook[RequestT, ResponseT] | None = None,
+    ) -> ServiceServer[RequestT, ResponseT]: ...
+
+    @overload
+    def serve(
+        self,
+        srv_type: str,
+        srv_name: str,
+        handler: Handler[Any, Any] | None = None,
+        *,
+        concurrency: int = 100,
+        backlog: int = 1000,
+        qos: QoSProfile | None = None,
+        on_error: ErrorHook[Any, Any] | None = None,
+        on_overload: OverloadHook[Any, Any] | None = None,
+    ) -> ServiceServer[Any, Any]: ...
 
     def serve(
         self,
         srv_type: Any,
         srv_name: str,
-        handler: Handler | None = None,
+        handler: Handler[Any, Any] | None = None,
         *,
         concurrency: int = 100,
         backlog: int = 1000,
-        qos: Any = None,
-        on_error: Handler | None = None,
-        on_overload: Handler | None = None,
-    ) -> ServiceServer:
-        """Serve a service, from now until the server or the session is closed.
+        qos: QoSProfile | None = None,
+        on_error: ErrorHook[Any, Any] | None = None,
+        on_overload: OverloadHook[Any, Any] | None = None,
+    ) -> ServiceServer[Any, Any]:
+        """Serve a service from now until the server or the session is closed.
 
         ::
 
@@ -296,31 +424,30 @@ class Session:
         Args:
             srv_type: a service class or its name.
             srv_name: the service's name.
-            handler: ``handler(request, response)``, plain or async, which returns the response; or
-                ``handler(call)`` with a `ServiceCall`, which returns the response, or None where
-                the call is answered with ``call.respond``, now or later. None for
-                ``async for call in server:``. How many arguments it has to get decides, here and
-                once. A plain handler holds up the loop as long as it runs.
-            concurrency: how many handlers run at a time at the most.
-            backlog: how many requests wait at the most.
+            handler: ``handler(request, response)``, plain or async, which returns the response. Or
+                ``handler(call)`` with a `ServiceCall`, which returns the response, or None if the
+                call is answered with ``call.respond``, now or later. None for
+                ``async for call in server:``. The number of required arguments decides, once, at
+                registration. A plain handler blocks the loop while it runs.
+            concurrency: most handlers that run at a time.
+            backlog: most requests that wait for a handler.
             qos: a ``QoSProfile``; None for the service default with a history of 1,000.
-            on_error: ``on_error(call, error)``, plain or async, when the handler has raised or has
-                returned something else: may return the response to send.
-            on_overload: ``on_overload(call)``, plain or async, for a request beyond the backlog:
-                may return the response to send. It is not held back by ``concurrency``, so it
-                should be quick.
+            on_error: ``on_error(call, error)``, plain or async, called when the handler has raised
+                an exception or returned something else than a response. It may return the response
+                to send.
+            on_overload: ``on_overload(call)``, plain or async, called for a request beyond the
+                backlog. It may return the response to send. ``concurrency`` does not limit it, so
+                it should be quick.
 
         Raises:
             TypeError: the handler is not callable, is a class, or takes neither one argument nor
-                two; a hook is not callable; type or QoS do not fit.
-            ValueError: a limit out of range; there is no such service type.
+                two; a hook is not callable; the type or the QoS does not fit.
+            ValueError: a limit is out of range; the service type does not exist.
             InvalidServiceName: ROS does not allow the name.
+            UsageError: this process serves or calls another type under this name.
             SessionClosed, ContextShutdown: the session has ended, or has begun to.
         """
-        core = self._use()
-        if self._closed:
-            raise _session_closed()
-        return core.serve(
+        server: ServiceServer[Any, Any] = self._use().serve(
             srv_type,
             srv_name,
             handler,
@@ -330,56 +457,43 @@ class Session:
             on_error=on_error,
             on_overload=on_overload,
         )
+        return server
 
     async def aclose(self) -> None:
         """End the session and everything it started; idempotent.
 
-        First the servers, whose handlers have five seconds to finish and may still call. Then calls
-        under way end with `SessionClosed`. It is not cut short by cancellation.
+        First the servers end: their handlers have five seconds to finish, and may still call. Then
+        the calls in progress end with `SessionClosed`. A cancellation does not cut this short.
         """
         if self._core is None:
             self._closed = True
             return
         self._core.check_loop()
-        self._closed = True
         await self._core.aclose()
 
     def _open_node(
         self, gateway: LoopGateway, on_graph: Callable[[], None], on_shutdown: Callable[[], None]
     ) -> NodePort:
-        """Open the node. A test's session overrides this, to open one in memory."""
+        """Open the node. A session in memory overrides this."""
         ros_node: type[RosNode] = _import_ros("rosasync.ros.node").RosNode
         return ros_node(self._options, gateway, on_graph, on_shutdown)
 
-    def _open_core(self) -> _Core:
-        if self._core is None:
-            raise UsageError("the session is not open: use `async with rosasync.Session(…)`")
-        return self._core
-
-    def _use(self) -> _Core:
+    def _use(self) -> Core:
         core = self._core
         if core is None:
-            raise (
-                SessionClosed("the session is closed")
-                if self._closed
-                else UsageError("the session is not open: use `async with rosasync.Session(…)`")
-            )
+            raise session_closed() if self._closed else _not_open()
         core.check_loop()
         return core
 
-    @property
-    def _loop(self) -> asyncio.AbstractEventLoop:
-        return self._open_core().loop
 
-
-class ServiceClient:
+class ServiceClient(Generic[RequestT, ResponseT]):
     """A service type and name bound to a session; see `Session.client`."""
 
-    __slots__ = ("_endpoint", "_session", "_timeout")
+    __slots__ = ("_core", "_service", "_timeout")
 
-    def __init__(self, session: Session, endpoint: Endpoint, timeout: float | None) -> None:
-        self._session = session
-        self._endpoint = endpoint
+    def __init__(self, core: Core, service: ServicePool, timeout: float | None) -> None:
+        self._core = core
+        self._service = service
         self._timeout = timeout
 
     def __repr__(self) -> str:
@@ -388,175 +502,77 @@ class ServiceClient:
     @property
     def srv_name(self) -> str:
         """The resolved service name."""
-        return self._endpoint.key.srv_name
+        return self._service.service.key.srv_name
 
     @property
     def srv_type(self) -> str:
-        """The service type's name."""
-        return self._endpoint.key.srv_type
+        """The name of the service type."""
+        return self._service.service.key.srv_type
 
     @property
     def ready(self) -> bool:
-        """Whether a server is matched, so that a call would be sent at once."""
-        return self._session._use().pool.is_ready(self._endpoint)
+        """Whether a server is matched, so that a call is sent at once."""
+        self._core.check_loop()
+        return self._service.is_ready()
 
     async def call(
         self,
-        request: Any = None,
+        request: RequestT | Mapping[str, Any] | None = None,
         *,
         timeout: Timeout = ...,
         wait: bool = True,
         retry: Retry | None = None,
-    ) -> Any:
+    ) -> ResponseT:
         """Call the service; see `Session.call`."""
-        pool = self._session._use().pool
-        message = pool.request(self._endpoint, request)
-        seconds = self._timeout if timeout is ... else check_timeout(timeout, None)
-        return await pool.call(self._endpoint, message, seconds, wait, retry)
+        core = self._core
+        core.check_loop()
+        service = self._service
+        message, seconds = core.arguments.call(
+            service.service, request, timeout, self._timeout, wait, retry
+        )
+        response: ResponseT = await service.call(message, seconds, wait, retry)
+        return response
 
     def start(
         self,
-        request: Any = None,
+        request: RequestT | Mapping[str, Any] | None = None,
         *,
         timeout: Timeout = ...,
         wait: bool = True,
         retry: Retry | None = None,
-    ) -> asyncio.Task[Any]:
+    ) -> asyncio.Task[ResponseT]:
         """Start the same call as a task; see `Session.start`."""
-        core = self._session._use()
-        message = core.pool.request(self._endpoint, request)
-        seconds = check_timeout(timeout, self._timeout)
-        return core.loop.create_task(core.pool.call(self._endpoint, message, seconds, wait, retry))
+        core = self._core
+        core.check_loop()
+        service = self._service
+        message, seconds = core.arguments.call(
+            service.service, request, timeout, self._timeout, wait, retry
+        )
+        service.check_open()
+        call = service.call(message, seconds, wait, retry, copy=request is not None)
+        return start_task(core.loop, call)
 
-    async def wait(self, timeout: float | None = None) -> None:
+    async def wait(self, timeout: Timeout = None) -> None:
         """Wait until a server is matched; see `Session.wait_for_service`."""
-        pool = self._session._use().pool
-        await pool.wait_for_server(self._endpoint, check_timeout(timeout, None))
+        self._core.check_loop()
+        await self._service.wait_for_server(check_timeout(timeout, self._timeout))
 
 
-class _Core:
-    """What an open session consists of, without a way back to it.
-
-    So a session that is dropped unclosed can be collected, say so, and end its thread.
-    """
-
-    def __init__(self, session: Session) -> None:
-        self.loop = asyncio.get_running_loop()
-        self.gateway = LoopGateway()
-        self.ros = session._open_node(self.gateway, self._graph_changed, self._context_shut_down)
-        self.name = self.ros.name
-        self.pool = ClientPool(
-            self.ros, session._options.limits, session._options.timeout, self._context_shut_down
-        )
-        self.gate = Gate(self.ros, self.gateway, self.pool, session._options.timeout)
-        self.portal = Portal(self.gate)
-        self.servers: dict[ServiceServer, None] = {}
-        self._ended: asyncio.Task[None] | None = None
-        self._session = weakref.ref(session)
-        atexit.register(self._exit)
-
-    def serve(self, srv_type: Any, srv_name: str, handler: Any, **options: Any) -> ServiceServer:
-        """Make a server that ends with the session."""
-        self.pool.check_open()
-        server = ServiceServer(
-            self.ros, srv_type, srv_name, handler, on_end=self.servers.pop, **options
-        )
-        self.servers[server] = None
-        return server
-
-    def check_loop(self) -> None:
-        """Raise `UsageError` on any other loop or thread than the session's."""
-        if asyncio._get_running_loop() is not self.loop:
-            raise UsageError(
-                "a session is used in the loop that opened it; from other threads there is "
-                "session.from_thread"
-            )
-
-    async def aclose(self) -> None:
-        """End everything, once; whoever else closes waits for the same end."""
-        if self._ended is None:
-            self._ended = self.loop.create_task(self._end())
-        await until_done(self._ended)
-
-    def abandon(self) -> None:
-        """End a session that nobody closed. Called by the garbage collector, on any thread."""
-        atexit.unregister(self._exit)
-        self.ros.stop()
-        self.gate.end()
-        self.gateway.close()
-        if self.loop.is_closed():
-            self._give_up()
-        else:
-            self.loop.call_soon_threadsafe(self._abandon)
-
-    def _abandon(self) -> None:
-        self.pool.end(_session_closed)
-        self._give_up()
-
-    def _give_up(self) -> None:
-        self._end_servers(_session_closed)
-        if self.ros.join():
-            self.ros.close()
-
-    def _exit(self) -> None:
-        """End the thread at the interpreter's exit; see ExecutorThread."""
-        session = self._session()
-        if session is not None and not session.closed:
-            session._closed = True
-            _warn_unclosed(session)
-        self.ros.stop()
-        self.gate.end()
-        self.gateway.close()
-        self.ros.join()
-
-    async def _end(self) -> None:
-        atexit.unregister(self._exit)
-        await asyncio.gather(*(server.aclose() for server in self.servers))
-        self.pool.end(_session_closed)
-        self.ros.stop()
-        self.gate.end()
-        self.gateway.close()
-        with anyio.move_on_after(ENDING, shield=True):
-            await self.ros.stopped()
-            self.ros.join()
-            self.ros.close()
-            return
-        logger.warning(
-            "a callback of node %s is still running: its executor thread is left behind",
-            self.ros.name,
-        )
-
-    def _graph_changed(self) -> None:
-        self.pool.graph_changed()
-
-    def _context_shut_down(self) -> None:
-        self.pool.end(context_shut_down)
-        self._end_servers(context_shut_down)
-
-    def _end_servers(self, ending: Callable[[], Exception]) -> None:
-        for server in tuple(self.servers):
-            server.end(ending)
-
-
-def _warn_unclosed(session: Session) -> None:
-    warnings.warn(f"unclosed {session!r}", ResourceWarning, source=session, stacklevel=2)
-
-
-def _session_closed() -> Exception:
-    return SessionClosed("the session is closed")
+def _not_open() -> UsageError:
+    return UsageError("the session is not open: use `async with rosasync.Session(…) as session:`")
 
 
 def _import_ros(module: str) -> Any:
     """Import a module that needs rclpy.
 
     Raises:
-        ImportError: rclpy is not there; the message says how to get it.
+        ImportError: rclpy is not installed; the message says how to install it.
     """
     try:
         return importlib.import_module(module)
     except ImportError as error:
         raise ImportError(
-            f"rosasync needs rclpy, which does not import here ({error}). Without a ROS "
+            f"rosasync needs rclpy, which cannot be imported here ({error}). Without a ROS "
             "installation: pip install 'rosasync[jazzy]' (or [kilted]). With one: source its "
             "setup file, /opt/ros/<distribution>/setup.bash, and use its Python"
         ) from error

@@ -16,12 +16,12 @@ __all__ = [
 
 
 class ServiceKey(NamedTuple):
-    """What the pool tells services apart by.
+    """The key that identifies a service in the pool.
 
     Attributes:
         srv_name: the resolved name.
-        srv_type: the type's name, ``"std_srvs/srv/SetBool"``.
-        qos: what was given as QoS; None for the default.
+        srv_type: the name of the type, ``"std_srvs/srv/SetBool"``.
+        qos: the QoS that was given, in a form that can be compared; None for the default.
     """
 
     srv_name: str
@@ -31,21 +31,21 @@ class ServiceKey(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class KeyStatistics:
-    """How a pool stands, for one service or in all.
+    """A snapshot of the pool's statistics, for one service or in total.
 
     Attributes:
-        clients: rclpy clients there are.
-        idle: those of them with nothing to do.
-        in_flight: requests somebody waits for an answer to.
-        waiting: callers queued for a place.
-        peak: most requests in flight at once (in all: the sum over the services).
-        created: clients made so far.
+        clients: rclpy clients that exist now.
+        idle: those of them that carry nothing.
+        in_flight: outstanding requests whose callers still wait.
+        waiting: callers that wait for a client.
+        peak: most requests in flight at once (in total: the sum over the services).
+        created: clients created so far.
         completed: calls answered.
         timed_out: calls whose deadline passed, in any phase.
         cancelled: calls cancelled, in any phase.
-        failed: calls that ended in another error: the server gone, the session closed.
-        abandoned: requests nobody waits for that still hold a place.
-        late: responses nobody waited for any more.
+        failed: calls that ended with another error, such as `ServerGone` or `SessionClosed`.
+        abandoned: requests without a caller that still count as outstanding.
+        late: responses that arrived after their caller had left.
         retried: requests sent again.
     """
 
@@ -66,28 +66,28 @@ class KeyStatistics:
 
 @dataclass(frozen=True, slots=True)
 class PoolStatistics(KeyStatistics):
-    """How a pool stands in all, and for each service in ``keys``."""
+    """A snapshot of the pool's statistics, in total, and for each service in ``keys``."""
 
     keys: Mapping[ServiceKey, KeyStatistics] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
 class ServerStatistics:
-    """How a server stands: three figures of now, then what happened so far.
+    """A snapshot of a server's statistics: three figures of now, then the totals so far.
 
     Attributes:
         srv_name: the resolved name.
-        running: handlers under way.
-        waiting: requests that wait for one.
-        unanswered: requests taken and neither answered nor given up: running, waiting, deferred.
+        running: handlers that run now.
+        waiting: requests that wait for a handler.
+        unanswered: requests taken and neither answered nor given up: running, waiting or deferred.
         taken: requests taken out of the middleware.
         responded: responses sent.
         deferred: handlers that returned without having responded.
-        failed: handlers that raised, or returned something that is no response.
-        rejected: requests that came when ``backlog`` others waited, answered or not.
-        dropped: calls that never get an answer, for other reasons than a failed handler: past the
-            backlog, unanswered when nobody held them any more, or when the server ended.
-        undeliverable: responses that reached nobody, as far as can be seen.
+        failed: handlers that raised an exception, or returned something else than a response.
+        rejected: requests that arrived when the backlog was full, answered or not.
+        dropped: calls that never get an answer although no handler failed: past the backlog,
+            garbage-collected unanswered, or unanswered when the server ended.
+        undeliverable: responses whose client could not be reached, as far as the middleware shows.
     """
 
     srv_name: str
@@ -105,12 +105,12 @@ class ServerStatistics:
 
 @dataclass(frozen=True, slots=True)
 class SessionStatistics:
-    """How a session stands.
+    """A snapshot of a session's statistics.
 
     Attributes:
         bridge: ``"direct"`` or ``"executor"``.
-        pool: what the pool's clients are doing.
-        servers: what the session's servers are doing, those that are not closed.
+        pool: the statistics of the client pool.
+        servers: the statistics of each server that is not closed.
     """
 
     bridge: str

@@ -1,13 +1,14 @@
-"""Coroutines that begin at once: what runs when, and that cancellation reaches them."""
+"""Tasks that start at once: what runs when, and that a cancellation reaches them."""
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable
+from typing import Any
 
 import pytest
 
-from rosasync.aio import begin
+from rosasync.aio import start_task
 
 pytestmark = pytest.mark.asyncio(loop_factories=["asyncio", "uvloop"])
 
@@ -35,23 +36,61 @@ class Work:
 
 async def test_it_runs_to_its_first_wait_at_once_and_goes_on_later() -> None:
     work = Work()
-    task = begin(work.loop, work.run())
+    task = start_task(work.loop, work.run())
     assert work.steps == ["begun"]
-    assert task is not None
     work.future.set_result("answered")
     assert work.steps == ["begun"]
     await task
     assert work.steps == ["begun", "answered", "ended", "left"]
 
 
-async def test_what_never_waits_needs_no_task() -> None:
+async def test_what_never_waits_has_run_already() -> None:
     steps: list[str] = []
 
-    async def run() -> None:
+    async def run() -> str:
         steps.append("begun")
+        return "ended"
 
-    assert begin(asyncio.get_running_loop(), run()) is None
+    task = start_task(asyncio.get_running_loop(), run())
     assert steps == ["begun"]
+    assert await task == "ended"
+
+
+async def test_an_error_before_the_first_wait_is_the_tasks() -> None:
+    async def run() -> None:
+        raise ValueError("no")
+
+    task = start_task(asyncio.get_running_loop(), run())
+    with pytest.raises(ValueError, match="no"):
+        await task
+
+
+async def test_a_cancellation_cannot_undo_what_has_ended() -> None:
+    async def run() -> str:
+        return "ended"
+
+    task = start_task(asyncio.get_running_loop(), run())
+    task.cancel()
+    assert await task == "ended"
+
+
+async def test_the_loops_task_factory_makes_the_task() -> None:
+    loop = asyncio.get_running_loop()
+    made: list[object] = []
+
+    def factory(
+        loop: asyncio.AbstractEventLoop, coroutine: Any, **options: Any
+    ) -> asyncio.Task[Any]:
+        made.append(coroutine)
+        return asyncio.Task(coroutine, loop=loop, **options)
+
+    loop.set_task_factory(factory)
+    work = Work()
+    task = start_task(loop, work.run())
+    assert len(made) == 1
+    assert "Work.run" in repr(task)
+    work.future.set_result("answered")
+    await task
 
 
 async def test_it_may_wait_for_nothing_but_its_turn() -> None:
@@ -62,8 +101,7 @@ async def test_it_may_wait_for_nothing_but_its_turn() -> None:
             await asyncio.sleep(0)
         steps.append("ended")
 
-    task = begin(asyncio.get_running_loop(), run())
-    assert task is not None
+    task = start_task(asyncio.get_running_loop(), run())
     await task
     assert steps == ["ended"]
 
@@ -78,14 +116,13 @@ async def some_turns() -> None:
 
 
 @pytest.mark.parametrize("wait", [no_turn, some_turns])
-async def test_a_cancellation_in_a_later_turn_reaches_it(
+async def test_a_cancellation_reaches_it(
     wait: Callable[[], Awaitable[None]],
 ) -> None:
     work = Work()
-    task = begin(work.loop, work.run())
-    assert task is not None
+    task = start_task(work.loop, work.run())
     await wait()
-    work.loop.call_soon(task.cancel)
+    task.cancel()
     with pytest.raises(asyncio.CancelledError):
         await task
     assert work.steps == ["begun", "CancelledError", "left"]
@@ -94,8 +131,7 @@ async def test_a_cancellation_in_a_later_turn_reaches_it(
 
 async def test_an_error_reaches_it_and_the_task() -> None:
     work = Work()
-    task = begin(work.loop, work.run())
-    assert task is not None
+    task = start_task(work.loop, work.run())
     work.future.set_exception(ValueError("no"))
     with pytest.raises(ValueError, match="no"):
         await task

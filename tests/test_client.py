@@ -10,20 +10,21 @@ import pytest
 
 from rosasync import Limits, Retry
 from rosasync.aio import Deadlines, Expired
-from rosasync.client import Call, Client, Counts
+from rosasync.call import Call
+from rosasync.client import Client, Counts
 from rosasync.statistics import ServiceKey
 from rosasync.testing import FakeClient, FakeGraph, FakeNode
 from tests.support.times import TICK, until
 
 
 class Rig:
-    """A client, the fake port below it, and how often it said that it has room."""
+    """A client, the fake port below it, and how often it reported capacity."""
 
     def __init__(self, **limits: Any) -> None:
         self.node = FakeNode(FakeGraph())
         self.counts = Counts()
-        self.room = 0
-        self.client = Client(self._open, Limits(**limits), self.counts, self._on_room)
+        self.capacity = 0
+        self.client = Client(self._open, Limits(**limits), self.counts, self._on_capacity)
         self._deadlines = Deadlines()
 
     def _open(self, deliver: Callable[[int, Any], None]) -> FakeClient:
@@ -31,8 +32,8 @@ class Rig:
         self.node.clients.append(self.port)
         return self.port
 
-    def _on_room(self) -> None:
-        self.room += 1
+    def _on_capacity(self) -> None:
+        self.capacity += 1
 
     async def call(self, deadline: float | None = None, retry: Retry | None = None) -> Any:
         """Call in the place of a lease that is held elsewhere."""
@@ -43,7 +44,7 @@ class Rig:
         try:
             return await call.future
         finally:
-            if call.out:
+            if call.in_flight:
                 call.end()
 
     async def calling(self, **options: Any) -> asyncio.Task[Any]:
@@ -68,10 +69,15 @@ async def test_a_passed_deadline_abandons_and_the_late_response_frees() -> None:
     deadline = asyncio.get_running_loop().time() + TICK
     with pytest.raises(Expired):
         await rig.call(deadline)
-    assert (rig.client.abandoned, rig.client.room) == (1, 0)
+    assert (rig.client.abandoned, rig.client.capacity) == (1, 0)
     assert not rig.client.is_idle
     rig.port.deliver(1, "late")
-    assert (rig.client.abandoned, rig.client.room, rig.counts.late, rig.room) == (0, 1, 1, 1)
+    assert (rig.client.abandoned, rig.client.capacity, rig.counts.late, rig.capacity) == (
+        0,
+        1,
+        1,
+        1,
+    )
 
 
 async def test_a_response_twice_is_late_once() -> None:

@@ -118,7 +118,7 @@ class TestCall:
                 thread = threads.submit(session.from_thread.call, ECHO, NAME, timeout=TICK)
                 with pytest.raises(ResponseTimeout, match=r"/echo: .*loop is stuck"):
                     thread.result(LIMIT)
-            await until(lambda: not session._core.gate._pending)  # type: ignore[union-attr]
+            await until(lambda: not session.core.gateway.pending)
             assert session.pool.statistics().created == 0
 
     @pytest.mark.asyncio(loop_factories=["asyncio", "uvloop"])
@@ -284,7 +284,7 @@ class TestMisuse:
         async with Session("misused") as session:
             with pytest.raises(error):
                 await in_thread(getattr(session.from_thread, way), *arguments, **options)
-            assert session._core.gate._pending == {}  # type: ignore[union-attr]
+            assert session.core.gateway.pending == 0
             assert session.pool.statistics().created == 0
 
     def test_before_the_session_is_open(self) -> None:
@@ -314,9 +314,7 @@ class TestEndings:
             with pytest.raises(SessionClosed):
                 future.result(LIMIT)
 
-    async def test_a_call_still_in_the_mailbox_when_the_session_closes(
-        self, bridge: Bridge
-    ) -> None:
+    async def test_a_call_still_queued_when_the_session_closes(self, bridge: Bridge) -> None:
         async with Session(bridge=bridge) as session:
             with ThreadPoolExecutor() as threads:
                 # The loop stands still meanwhile, and does not turn before the session closes.
@@ -385,7 +383,7 @@ class TestEndings:
                 thread.result(LIMIT)
             with pytest.raises(SessionClosed):
                 threads.submit(session.from_thread.call, ECHO, NAME).result(LIMIT)
-        session._closed = True
+        session.core.closed = True
 
     def test_the_loops_tasks_are_cancelled_and_the_session_is_not_closed(self) -> None:
         """As ``asyncio.run`` does with what is left at its end."""

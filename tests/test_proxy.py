@@ -190,7 +190,7 @@ def test_the_tables_are_complete() -> None:
     assert set(ASKED) == set(ProxyState)
     methods = {name for name, _ in inspect.getmembers(AsyncServiceProxy, inspect.isfunction)}
     assert {name for name in methods if not name.startswith("_")} == {
-        *("call_service", "wait_for_service", "stop_call", "shutdown", "request"),
+        *("call_service", "wait_for_service", "stop_call", "shutdown", "make_request"),
         *("get_state", "get_response", "get_errors"),
     }
 
@@ -339,7 +339,7 @@ async def test_in_the_loop_the_request_is_sent_by_the_tick_that_asks() -> None:
         await stage.session.wait_for_service(ECHO, NAME)
         for count in (1, 2):
             stage.proxy.call_service(request_of(str(count)))
-            (client,) = stage.session._open_core().ros.clients  # type: ignore[attr-defined]
+            (client,) = stage.session.node.clients
             assert len(client.sent) == count
         stage.answer()
         assert await settled(stage.proxy) is READY
@@ -416,7 +416,7 @@ async def test_nothing_is_kept_of_what_has_ended(state: ProxyState) -> None:
         await stage.reach(state)
         await turns()
         assert stage.proxy._working is None
-        assert stage.proxy._gate._pending == {}
+        assert stage.session.core.gateway.pending == 0
 
 
 class TestForerunner:

@@ -176,6 +176,10 @@ class RosNode:
             service.srv_type, service.srv_name, service.qos or default_qos(), deliver
         )
 
+    def count_servers(self, service: Service) -> int:
+        """Return how many servers have the name, whatever their type."""
+        return self._servers(service.key.srv_name)
+
     def find_servers(self, service: Service) -> frozenset[Hashable]:
         """Identify the servers that fit."""
         name, srv_type, _ = service.key

@@ -305,6 +305,10 @@ class FakeNode:
         self.graph.changed()
         return opened
 
+    def count_servers(self, service: Service) -> int:
+        """Return how many servers have this name."""
+        return sum(server.srv_name == service.key.srv_name for server in self.graph.servers)
+
     def find_servers(self, service: Service) -> frozenset[Hashable]:
         """Identify the servers of this name and type."""
         return frozenset(map(id, self.graph.find(service.key.srv_type, service.key.srv_name)))

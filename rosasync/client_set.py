@@ -1,0 +1,225 @@
+"""The clients of one service: created on demand, matched with servers, evicted when idle."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
+
+from rosasync.client import Client, Counts
+from rosasync.ports import PortDestroyed
+
+if TYPE_CHECKING:
+    from rosasync.call_errors import CallErrors
+    from rosasync.graph_watch import GraphWatch
+    from rosasync.options import Limits
+    from rosasync.ports import NodePort, Service
+
+__all__ = ["ClientSet"]
+
+logger = logging.getLogger("rosasync")
+
+EVICT_MIN = 0.05
+"""Least seconds between two looks for idle clients."""
+
+
+class ClientSet:
+    """The clients of one service. Confined to the loop's thread.
+
+    Args:
+        service: the service.
+        node: creates the clients, and knows the servers.
+        limits: how many clients there may be, and for how long unused.
+        watch: tells the generation of the graph.
+        errors: of the service.
+        on_capacity: called when a place in a client's window becomes free.
+        has_callers: returns whether callers wait for a client; none is evicted then.
+    """
+
+    def __init__(
+        self,
+        service: Service,
+        node: NodePort,
+        limits: Limits,
+        watch: GraphWatch,
+        errors: CallErrors,
+        on_capacity: Callable[[], None],
+        has_callers: Callable[[], bool],
+    ) -> None:
+        self.counts = Counts()
+        self._service = service
+        self._node = node
+        self._limits = limits
+        self._watch = watch
+        self._errors = errors
+        self._on_capacity = on_capacity
+        self._has_callers = has_callers
+        self._loop = asyncio.get_running_loop()
+        self._clients: list[Client] = []
+        # Runs while there are clients.
+        self._evict_timer: asyncio.TimerHandle | None = None
+        self._servers_counted = 1
+        self._growth_failed = False
+
+    def __len__(self) -> int:
+        return len(self._clients)
+
+    def __iter__(self) -> Iterator[Client]:
+        # A copy: to look at a client may show that it was destroyed, and remove it.
+        return iter(tuple(self._clients))
+
+    @property
+    def capacity(self) -> int:
+        """How many more requests fit into the windows, of clients that are not matched too."""
+        return sum(max(client.capacity, 0) for client in self._clients)
+
+    @property
+    def abandoned(self) -> int:
+        """The number of requests without a caller that still take a place."""
+        return sum(client.abandoned for client in self._clients)
+
+    @property
+    def idle(self) -> int:
+        """The number of clients that carry nothing."""
+        return sum(client.is_idle for client in self._clients)
+
+    @property
+    def awaits_match(self) -> bool:
+        """Whether a client with capacity is not known to be matched."""
+        generation = self._watch.generation
+        return any(
+            client.capacity > 0 and client.matched_generation != generation
+            for client in self._clients
+        )
+
+    def lease(self) -> Client | None:
+        """Lease a matched client that has capacity, if there is one."""
+        watch = self._watch
+        if not watch.polling:
+            watch.keep_polling()
+        generation = watch.generation
+        for client in self._clients:
+            if client.capacity > 0 and (
+                client.matched_generation == generation or self.is_matched(client)
+            ):
+                client.leases += 1
+                return client
+        return None
+
+    def is_matched(self, client: Client) -> bool:
+        """Return whether a client is matched with a server, in this generation of the graph."""
+        generation = self._watch.generation
+        if client.matched_generation == generation:
+            return True
+        if not self._is_ready(client):
+            return False
+        client.matched_generation = generation
+        self._warn_of_several_servers()
+        return True
+
+    def any_matched(self) -> bool:
+        """Return whether a client is matched with a server."""
+        return any(self.is_matched(client) for client in self)
+
+    def servers_gone(self) -> bool:
+        """Return whether every server that fits has vanished; others of the name do not count."""
+        if not self._node.count_servers(self._service):
+            return True
+        if any(self._is_ready(client) for client in self):
+            return False
+        return not self._node.find_servers(self._service)
+
+    def grow(self, callers: int) -> None:
+        """Create clients while there is less capacity than ``callers``, matched or not.
+
+        Raises:
+            Exception: there is no client, and none can be created.
+        """
+        try:
+            while len(self._clients) < self._limits.clients and self.capacity < callers:
+                self.open()
+        except Exception as error:
+            if not self._clients:
+                raise
+            if not self._growth_failed:
+                self._growth_failed = True
+                logger.warning(
+                    "%s: no further client can be created, and the calls share %d: %s",
+                    self._service.key.srv_name,
+                    len(self._clients),
+                    error,
+                )
+
+    def open(self) -> None:
+        """Create a client; raises as `NodePort.open_client`."""
+        client = Client(
+            lambda deliver: self._node.open_client(self._service, deliver),
+            self._limits,
+            self.counts,
+            self._on_capacity,
+        )
+        self._clients.append(client)
+        self.counts.created += 1
+        self._growth_failed = False
+        self._watch.poll_soon()
+        if self._evict_timer is None:
+            self._evict_at(self._loop.time() + self._limits.idle)
+
+    def drop(self, client: Client) -> None:
+        """Remove a client that was destroyed by other means, such as ``Node.destroy_client``."""
+        if client in self._clients:
+            self._clients.remove(client)
+            client.fail(self._errors.client_destroyed)
+            client.close()
+            self._on_capacity()
+
+    def fail(self, error: Callable[[], Exception]) -> None:
+        """End every call in flight with an error."""
+        for client in self._clients:
+            client.fail(error)
+
+    def close(self) -> None:
+        """Destroy the clients; `fail` their calls first. Idempotent."""
+        if self._evict_timer is not None:
+            self._evict_timer.cancel()
+        for client in self._clients:
+            client.close()
+        self._clients.clear()
+
+    def _is_ready(self, client: Client) -> bool:
+        try:
+            return client.ready()
+        except PortDestroyed:
+            self.drop(client)
+            return False
+
+    def _warn_of_several_servers(self) -> None:
+        # The count is cheap, and never too low: only a new maximum is worth the query.
+        counted = self._node.count_servers(self._service)
+        if counted <= self._servers_counted:
+            return
+        self._servers_counted = counted
+        if (servers := len(self._node.find_servers(self._service))) > 1:
+            logger.warning(
+                "%s: %d servers answer this name; the first response wins, and the others are "
+                "dropped",
+                self._service.key.srv_name,
+                servers,
+            )
+
+    def _evict_at(self, when: float) -> None:
+        self._evict_timer = self._loop.call_at(when, self._evict) if when < math.inf else None
+
+    def _evict(self) -> None:
+        """Destroy the clients that have been idle for `Limits.idle` seconds."""
+        now, idle = self._loop.time(), self._limits.idle
+        self._evict_timer = None
+        for client in self:
+            if client.is_idle and client.idle_since + idle <= now and not self._has_callers():
+                self._clients.remove(client)
+                client.close()
+        if self._clients:
+            since = min(c.idle_since if c.is_idle else now for c in self._clients)
+            self._evict_at(max(since + idle, now + EVICT_MIN))

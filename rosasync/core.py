@@ -1,0 +1,162 @@
+"""What an open session consists of, and its one end."""
+
+from __future__ import annotations
+
+import _thread
+import asyncio
+import atexit
+import logging
+import threading
+import warnings
+import weakref
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import anyio
+
+from rosasync.aio import until_done
+from rosasync.arguments import ArgumentChecker
+from rosasync.errors import ContextShutdown, SessionClosed, UsageError
+from rosasync.gateway import LoopGateway
+from rosasync.pool import ClientPool
+from rosasync.portal import Portal
+from rosasync.server import ServiceServer
+
+if TYPE_CHECKING:
+    from rosasync.options import SessionOptions
+    from rosasync.ports import NodePort
+
+__all__ = ["Core", "OpenNode"]
+
+logger = logging.getLogger("rosasync")
+
+END_TIMEOUT = 5.0
+"""Seconds for a callback of the node to end with the session, before its thread is left behind."""
+
+OpenNode = Callable[[LoopGateway, Callable[[], None], Callable[[], None]], "NodePort"]
+"""Opens a node, given the gateway, and what to call when the graph changes and the context ends."""
+
+
+class Core:
+    """The parts of an open session. It does not refer to the session itself.
+
+    So a session that is dropped unclosed is garbage-collected, warns, and ends its thread.
+    """
+
+    def __init__(self, session: object, options: SessionOptions, open_node: OpenNode) -> None:
+        self.loop = asyncio.get_running_loop()
+        self.timeout = options.timeout
+        self.gateway = LoopGateway()
+        self.node = open_node(self.gateway, self._graph_changed, self._context_shut_down)
+        self.name = self.node.name
+        self.arguments = ArgumentChecker(self.node)
+        self.pool = ClientPool(
+            self.node, self.arguments, options.limits, options.timeout, self._context_shut_down
+        )
+        self.portal = Portal(self.node, self.gateway, self.arguments, self.pool, options.timeout)
+        self.servers: dict[ServiceServer[Any, Any], None] = {}
+        self.closed = False
+        self._session = weakref.ref(session)
+        self._end_task: asyncio.Task[None] | None = None
+        self._cleaned_up = threading.Event()
+        atexit.register(self._exit)
+
+    def check_loop(self) -> None:
+        """Raise `UsageError` on any other loop or thread than the session's."""
+        if asyncio._get_running_loop() is not self.loop:
+            raise UsageError(
+                "a session is used in the loop that opened it; from other threads use "
+                "session.from_thread"
+            )
+
+    def serve(self, srv_type: Any, srv_name: str, handler: Any, **options: Any) -> Any:
+        """Create a server that ends with the session."""
+        if self.closed:
+            raise session_closed()
+        self.pool.check_open()
+        server: ServiceServer[Any, Any] = ServiceServer(
+            self.node, srv_type, srv_name, handler, on_end=self.servers.pop, **options
+        )
+        self.servers[server] = None
+        return server
+
+    async def aclose(self) -> None:
+        """End everything, once. Everybody who closes waits for the same end."""
+        self.closed = True
+        if self._end_task is None:
+            self._end_task = self.loop.create_task(self._end())
+        await until_done(self._end_task)
+
+    def abandon(self, session: object) -> None:
+        """Clean up after a session that was never closed. From any thread, for ``__del__``.
+
+        The garbage collector may run this while the thread holds any lock. So it takes none, which
+        also rules out a ``threading.Thread``.
+        """
+        _warn_unclosed(session)
+        self.closed = True
+        self.node.stop()
+        try:
+            self.loop.call_soon_threadsafe(self._abandon)
+        except RuntimeError:
+            # The loop is closed.
+            _thread.start_new_thread(self._clean_up, ())
+
+    def _abandon(self) -> None:
+        self.pool.end(session_closed)
+        self._clean_up()
+
+    def _clean_up(self) -> None:
+        self.gateway.close()
+        self._end_servers(session_closed)
+        if self.node.join():
+            self.node.close()
+        atexit.unregister(self._exit)
+        self._cleaned_up.set()
+
+    def _exit(self) -> None:
+        """End the executor thread when the interpreter exits, which would abort on it."""
+        session = self._session()
+        if session is not None and not self.closed:
+            self.closed = True
+            _warn_unclosed(session)
+        elif self.closed and self.loop.is_closed():
+            self._cleaned_up.wait(END_TIMEOUT)
+        self.node.stop()
+        self.gateway.close()
+        self.node.join()
+
+    async def _end(self) -> None:
+        atexit.unregister(self._exit)
+        await asyncio.gather(*(server.aclose() for server in self.servers))
+        self.pool.end(session_closed)
+        self.node.stop()
+        self.gateway.close()
+        with anyio.move_on_after(END_TIMEOUT, shield=True):
+            await self.node.stopped()
+            self.node.join()
+            self.node.close()
+            return
+        logger.warning(
+            "a callback of node %s still runs: its executor thread is left behind", self.name
+        )
+
+    def _graph_changed(self) -> None:
+        self.pool.graph_changed()
+
+    def _context_shut_down(self) -> None:
+        self.pool.end(ContextShutdown)
+        self._end_servers(ContextShutdown)
+
+    def _end_servers(self, ending: Callable[[], Exception]) -> None:
+        for server in tuple(self.servers):
+            server.end(ending)
+
+
+def session_closed() -> SessionClosed:
+    """Make the error for a session that has been closed."""
+    return SessionClosed("the session is closed")
+
+
+def _warn_unclosed(session: object) -> None:
+    warnings.warn(f"unclosed {session!r}", ResourceWarning, source=session, stacklevel=2)

@@ -1,0 +1,450 @@
+"""One service in the pool: the queue for its clients, and the calls they carry."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+from collections import OrderedDict
+from collections.abc import Callable
+from copy import deepcopy
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+from rosasync.aio import Deadlines, Expired
+from rosasync.call import Call
+from rosasync.call_errors import CallErrors
+from rosasync.client import Client
+from rosasync.client_set import ClientSet
+from rosasync.errors import ContextShutdown, RosasyncError
+from rosasync.ports import PortDestroyed
+from rosasync.statistics import KeyStatistics
+
+if TYPE_CHECKING:
+    from rosasync.graph_watch import GraphWatch
+    from rosasync.options import Limits, Retry
+    from rosasync.ports import NodePort, Service
+
+__all__ = ["MATCH_TIMEOUT", "ServicePool"]
+
+logger = logging.getLogger("rosasync")
+
+OnClient = Callable[[Client], None]
+"""Called with the client when one is granted."""
+
+GONE_DELAY = 0.02
+"""Seconds for a response that a server sent just before it vanished to arrive."""
+MATCH_TIMEOUT = 1.0
+"""Seconds for a new client to match a server that the graph already shows."""
+
+
+class ServicePool:
+    """The clients of one service, and the callers who wait for them.
+
+    Confined to the loop's thread. Its state changes only between awaits, so there is no lock.
+
+    A caller sends at once if the queue is empty and a matched client has capacity. All others join
+    the queue. Capacity that becomes free only schedules a dispatch for the next turn of the loop,
+    and the dispatch decides and sends. So a caller who is cancelled in the same turn is done by
+    then, and a caller who comes later finds the queue and cannot overtake it.
+    """
+
+    def __init__(
+        self,
+        service: Service,
+        node: NodePort,
+        limits: Limits,
+        watch: GraphWatch,
+        deadlines: Deadlines,
+    ) -> None:
+        self.service = service
+        self._node = node
+        self._limits = limits
+        self._watch = watch
+        self._deadlines = deadlines
+        self._loop = asyncio.get_running_loop()
+        self._errors = CallErrors(service, node)
+        self._clients = ClientSet(
+            service, node, limits, watch, self._errors, self._on_capacity, self._has_callers
+        )
+        self._counts = self._clients.counts
+        self._queue: OrderedDict[asyncio.Future[Any], OnClient] = OrderedDict()
+        # Callers who wait for a match, and for which client: their leased one, or any (None).
+        self._ready_waiters: dict[asyncio.Future[None], Client | None] = {}
+        self._dispatch_scheduled = False
+        # Runs for GONE_DELAY after the last server has vanished.
+        self._gone_timer: asyncio.TimerHandle | None = None
+        self._ending: Callable[[], Exception] | None = None
+
+    def __repr__(self) -> str:
+        return (
+            f"<ServicePool {self.service.key.srv_name} {len(self._clients)} clients, "
+            f"{self._counts.in_flight} in flight, {len(self._queue)} waiting>"
+        )
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether there are callers, or requests without a caller."""
+        return bool(
+            self._queue or self._ready_waiters or self._counts.in_flight or self._clients.abandoned
+        )
+
+    @property
+    def awaits_match(self) -> bool:
+        """Whether callers wait for a client to be matched, and not only for capacity."""
+        generation = self._watch.generation
+        for leased in self._ready_waiters.values():
+            if leased is None or leased.matched_generation != generation:
+                return True
+        return bool(self._queue) and self._clients.awaits_match
+
+    def statistics(self) -> KeyStatistics:
+        """Take a snapshot."""
+        return KeyStatistics(
+            clients=len(self._clients),
+            idle=self._clients.idle,
+            waiting=len(self._queue),
+            abandoned=self._clients.abandoned,
+            **asdict(self._counts),
+        )
+
+    # Calls, leases and waits.
+
+    async def call(
+        self,
+        request: Any,
+        timeout: float | None,
+        wait: bool = True,
+        retry: Retry | None = None,
+        *,
+        leased: Client | None = None,
+        copy: bool = False,
+    ) -> Any:
+        """Send a request with the first client that has capacity, and return the response.
+
+        Args:
+            request: the message.
+            timeout: seconds for the whole call, None for no deadline.
+            wait: whether to wait for a server if there is none.
+            retry: when to send again.
+            leased: send with this client, in the place of its lease.
+            copy: copy the request unless it is sent in this turn, and only once.
+
+        Raises:
+            Exception: as `Session.call`.
+        """
+        loop = self._loop
+        started = loop.time()
+        deadline = None if timeout is None else started + timeout
+        call = Call(loop.create_future(), request, retry, leased is not None)
+        entry = None
+        try:
+            if leased is not None:
+                await self._wait_until_ready(leased, deadline)
+                call.start(leased)
+            else:
+                client = None if self._queue else self._clients.lease()
+                if copy and (client is None or retry is not None):
+                    call.request = deepcopy(request)
+                if client is not None:
+                    call.start(client)
+                else:
+                    if not wait:
+                        await self._check_server(started, deadline)
+                    self._enqueue(call.future, call.start)
+            if deadline is not None:
+                entry = self._deadlines.set(call.future, deadline)
+            response = await call.future
+        except BaseException as error:
+            raise self._count_failure(call, error, started) from None
+        finally:
+            if entry is not None:
+                entry[-1] = None
+            if call.in_flight:
+                call.end()
+            elif not call.started:
+                self._queue.pop(call.future, None)
+        self._counts.completed += 1
+        return response
+
+    async def lease(self, timeout: float | None) -> Client:
+        """Wait for a client with capacity; `Client.release` ends the lease.
+
+        Raises:
+            ServiceUnavailable, QueueTimeout: there was none within ``timeout`` seconds.
+            PoolFull: too many callers wait.
+        """
+        started = self._loop.time()
+        client = None if self._queue else self._clients.lease()
+        if client is not None:
+            return client
+        waiter: asyncio.Future[Client] = self._loop.create_future()
+        try:
+            self._enqueue(waiter, waiter.set_result)
+            await self._wait(waiter, None if timeout is None else started + timeout)
+            return waiter.result()
+        except Expired:
+            raise self._unreached(started) from None
+        except BaseException:
+            # Granted in the turn in which the caller was cancelled.
+            if waiter.done() and not waiter.cancelled() and waiter.exception() is None:
+                waiter.result().release()
+            raise
+        finally:
+            self._queue.pop(waiter, None)
+
+    async def wait_for_server(self, timeout: float | None) -> None:
+        """Wait until a server is matched.
+
+        Raises:
+            ServiceUnavailable: none was, within ``timeout`` seconds.
+        """
+        started = self._loop.time()
+        if self.is_ready():
+            return
+        try:
+            await self._wait_until_ready(None, None if timeout is None else started + timeout)
+        except Expired:
+            raise self._errors.unavailable(self._loop.time() - started) from None
+
+    async def warm(self, clients: int, match_by: float) -> None:
+        """Create clients and match them.
+
+        Args:
+            clients: how many there are to be.
+            match_by: the loop time at which to stop waiting for the match.
+        """
+        while len(self._clients) < clients:
+            self.check_open()
+            self._clients.open()
+            await asyncio.sleep(0)
+        for client in self._clients:
+            try:
+                await self._wait_until_ready(client, match_by)
+            except Expired:
+                return
+
+    def is_ready(self) -> bool:
+        """Return whether a client is matched with a server."""
+        self.check_open()
+        if not self._clients:
+            self._clients.open()
+        self._watch.keep_polling()
+        return self._clients.any_matched()
+
+    def is_provided(self) -> bool:
+        """Return whether the graph shows a server that fits."""
+        return bool(self._node.find_servers(self.service))
+
+    def check_open(self) -> None:
+        """Raise the error that calls get, once the session has ended."""
+        if self._ending is not None:
+            raise self._ending()
+
+    def end(self, ending: Callable[[], Exception]) -> None:
+        """End every call with the error that ``ending`` makes, and destroy the clients."""
+        self._ending = ending
+        for future in (*self._queue, *self._ready_waiters):
+            if not future.done():
+                future.set_exception(ending())
+        if self._gone_timer is not None:
+            self._gone_timer.cancel()
+        self._clients.fail(ending)
+        self._clients.close()
+
+    def on_graph(self) -> None:
+        """Serve the callers who wait for a match, and notice servers that have vanished."""
+        if self._queue or self._ready_waiters:
+            self._dispatch()
+        outstanding = self._counts.in_flight or self._clients.abandoned
+        if outstanding and self._gone_timer is None and self._clients.servers_gone():
+            self._gone_timer = self._loop.call_later(GONE_DELAY, self._end_requests)
+
+    # The queue.
+
+    def _enqueue(self, waiter: asyncio.Future[Any], on_client: OnClient) -> None:
+        """Join the queue. ``on_client`` is called when a client is granted and the waiter not done.
+
+        Raises:
+            PoolFull: the queue is as long as allowed.
+            Exception: there is no client, and none can be created.
+        """
+        self.check_open()
+        waiting = len(self._queue)
+        self._clients.grow(waiting + 1)
+        # Callers for whom there is capacity do not count: they wait for a match or a dispatch.
+        capacity = self._clients.capacity
+        if waiting >= self._limits.waiting + capacity:
+            raise self._errors.pool_full(waiting, self._limits.waiting)
+        self._queue[waiter] = on_client
+        if capacity and not waiting:
+            self._schedule_dispatch()
+
+    def _has_callers(self) -> bool:
+        return bool(self._queue or self._ready_waiters)
+
+    def _on_capacity(self) -> None:
+        if self._queue or self._ready_waiters:
+            self._schedule_dispatch()
+
+    def _schedule_dispatch(self) -> None:
+        if not self._dispatch_scheduled:
+            self._dispatch_scheduled = True
+            self._loop.call_soon(self._run_dispatch)
+
+    def _run_dispatch(self) -> None:
+        self._dispatch_scheduled = False
+        with self._watch.shutdown_noticed():
+            self._dispatch()
+            if self.awaits_match:
+                self._watch.poll_soon()
+
+    def _dispatch(self) -> None:
+        """Grant clients to the callers who wait, in their order, while there is capacity."""
+        if self._ending is not None:
+            return
+        self._wake_ready_waiters()
+        while self._queue:
+            waiter, on_client = next(iter(self._queue.items()))
+            client = None if waiter.done() else self._clients.lease()
+            if client is None and not waiter.done():
+                break
+            del self._queue[waiter]
+            if client is not None:
+                self._grant(client, waiter, on_client)
+        self._replace_clients()
+
+    def _grant(self, client: Client, waiter: asyncio.Future[Any], on_client: OnClient) -> None:
+        try:
+            on_client(client)
+        except Exception as error:
+            # An error of one caller must not end the grants of the others.
+            client.release()
+            if not waiter.done():
+                waiter.set_exception(error)
+
+    def _wake_ready_waiters(self) -> None:
+        for waiter, leased in self._ready_waiters.items():
+            if waiter.done():
+                continue
+            try:
+                if self._is_ready_for(leased):
+                    waiter.set_result(None)
+            except ContextShutdown as error:
+                waiter.set_exception(error)
+
+    def _replace_clients(self) -> None:
+        """Create clients for the callers who wait, if others were destroyed by other means.
+
+        If that fails, all of them get the error.
+        """
+        callers = len(self._queue) or bool(self._ready_waiters)
+        try:
+            self._clients.grow(callers)
+        except Exception as error:
+            for waiter in (*self._queue, *self._ready_waiters):
+                if not waiter.done():
+                    waiter.set_exception(error)
+
+    def _is_ready_for(self, leased: Client | None) -> bool:
+        if leased is None:
+            return self._clients.any_matched()
+        if leased.closed:
+            raise self._errors.client_destroyed()
+        return leased.capacity >= 0 and self._clients.is_matched(leased)
+
+    async def _wait_until_ready(self, leased: Client | None, deadline: float | None) -> None:
+        """Wait until a client is matched: any, or the leased one with a place in its window.
+
+        Raises:
+            Expired: the deadline passed.
+        """
+        self.check_open()
+        if self._is_ready_for(leased):
+            return
+        waiter: asyncio.Future[None] = self._loop.create_future()
+        self._ready_waiters[waiter] = leased
+        self._watch.poll_soon()
+        try:
+            await self._wait(waiter, deadline)
+        finally:
+            del self._ready_waiters[waiter]
+
+    async def _wait(self, future: asyncio.Future[Any], deadline: float | None) -> None:
+        """Wait for a future that a dispatch completes.
+
+        Raises:
+            Expired: the deadline passed.
+        """
+        entry = None if deadline is None else self._deadlines.set(future, deadline)
+        try:
+            await future
+        finally:
+            if entry is not None:
+                entry[-1] = None
+
+    async def _check_server(self, started: float, deadline: float | None) -> None:
+        """Raise `ServiceUnavailable` if the graph shows no server; otherwise wait for the match."""
+        if self.is_ready():
+            return
+        now = self._loop.time()
+        if not self.is_provided():
+            raise self._errors.unavailable(now - started)
+        left = math.inf if deadline is None else max(0.0, deadline - now)
+        await self.wait_for_server(min(MATCH_TIMEOUT, left))
+
+    # Failures.
+
+    def _end_requests(self) -> None:
+        self._gone_timer = None
+        with self._watch.shutdown_noticed():
+            if self._clients.servers_gone():
+                self._watch.advance()
+                self._clients.fail(_Gone)
+
+    def _unreached(self, started: float) -> Exception:
+        """Make the error for a deadline that passed before the request was sent."""
+        if self._ending is not None:
+            return self._ending()
+        elapsed = self._loop.time() - started
+        if not self.is_ready():
+            return self._errors.unavailable(elapsed)
+        return self._errors.queue_timeout(elapsed, self._counts.in_flight, self._clients.abandoned)
+
+    def _count_failure(self, call: Call, error: BaseException, started: float) -> BaseException:
+        """Count a failed call, and return the error in the caller's terms."""
+        counts = self._counts
+        error = self._translate(call, error, started)
+        if isinstance(error, asyncio.CancelledError):
+            counts.cancelled += 1
+            if call.started and not call.future.cancelled() and call.future.exception() is None:
+                counts.late += 1  # Answered, but its task was cancelled before it resumed.
+        elif isinstance(error, TimeoutError):
+            counts.timed_out += 1
+            logger.debug("%s", error)
+        else:
+            counts.failed += 1
+            logger.debug("%s: %r", self.service.key.srv_name, error)
+        return error
+
+    def _translate(self, call: Call, error: BaseException, started: float) -> BaseException:
+        elapsed = self._loop.time() - started
+        match error:
+            case asyncio.CancelledError() | RosasyncError():
+                return error
+            case Expired() if not call.started:
+                return self._unreached(started)
+            case Expired():
+                return self._errors.response_timeout(elapsed)
+            case _Gone():
+                return self._errors.server_gone(elapsed)
+            case PortDestroyed():
+                self._clients.drop(call.client)
+                return self._errors.client_destroyed()
+            case _ if not self._node.ok():
+                return ContextShutdown() if self._ending is None else self._ending()
+        return error
+
+
+class _Gone(Exception):
+    """Every server that fits has vanished."""
