@@ -233,7 +233,7 @@ def _stamping(session: rosasync.Session, stamps: Stamps) -> Iterator[None]:
     """Puts stamps where the session's one client touches the middleware, for one call."""
     pool: Any = session.pool
     (service,) = pool._services.values()
-    (client,) = service._clients
+    (client,) = service.clients
     port: Any = client._port
     kept = (port.send_request, port._take, port._deliver, os.eventfd_read)
     port.send_request = stamps.around(port.send_request, "send", "sent")

@@ -83,6 +83,11 @@ class ServicePool:
         )
 
     @property
+    def clients(self) -> tuple[Client, ...]:
+        """The clients that exist now."""
+        return tuple(self._clients)
+
+    @property
     def is_busy(self) -> bool:
         """Whether there are callers, or requests without a caller."""
         return bool(

@@ -1,0 +1,248 @@
+"""One service in the pool, on fake ports: what one caller does never harms the others."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import Any
+
+import pytest
+
+from rosasync import ContextShutdown, Limits, Retry, ServerGone, Session
+from rosasync.ports import PortDestroyed
+from rosasync.testing import FakeClient, FakeGraph
+from tests.support.times import LIMIT, TICK, until
+
+
+class Echo:
+    """A service of plain Python."""
+
+    class Request:
+        def __init__(self, value: object = None) -> None:
+            self.value = value
+
+    class Response:
+        def __init__(self, value: object = None) -> None:
+            self.value = value
+
+
+def echo(request: Echo.Request) -> Echo.Response:
+    return Echo.Response(request.value)
+
+
+async def ask(session: Session, value: object, **options: Any) -> object:
+    response = await session.call(Echo, "/echo", Echo.Request(value), **options)
+    return response.value
+
+
+def the_client(graph: FakeGraph) -> FakeClient:
+    ((client,),) = ([*node.clients] for node in graph.nodes)
+    return client
+
+
+async def test_a_send_that_fails_gives_its_place_back(fake_graph: FakeGraph) -> None:
+    fake_graph.serve(Echo, "/echo", echo)
+    async with fake_graph.session(limits=Limits(in_flight=1)) as session:
+        assert await ask(session, 0) == 0
+        service = session.pool.service(Echo, "/echo", None)
+        (client,) = service.clients
+        send = client.send
+
+        def refuse(request: object) -> int:
+            raise OverflowError("does not fit")
+
+        client.send = refuse
+        for retry in (None, Retry()):
+            with pytest.raises(OverflowError, match="does not fit"):
+                await ask(session, 1, retry=retry)
+        client.send = send
+        assert await ask(session, 2) == 2
+        total = session.pool.statistics()
+        assert (total.in_flight, total.abandoned, total.failed) == (0, 0, 2)
+
+
+async def test_a_queued_send_that_fails_does_not_end_those_behind_it(
+    fake_graph: FakeGraph,
+) -> None:
+    fake_graph.serve(Echo, "/echo", echo)
+    async with fake_graph.session(limits=Limits(in_flight=1)) as session:
+        assert await ask(session, 0) == 0
+        (client,) = session.pool.service(Echo, "/echo", None).clients
+        send = client.send
+
+        def refuse_odd(request: Any) -> int:
+            if request.value % 2:
+                raise OverflowError("odd")
+            return send(request)
+
+        client.send = refuse_odd
+        ended = await asyncio.gather(*(ask(session, n) for n in range(10)), return_exceptions=True)
+        assert [type(e) if isinstance(e, Exception) else e for e in ended] == [
+            n if n % 2 == 0 else OverflowError for n in range(10)
+        ]
+
+
+async def test_a_lease_taken_in_the_turn_of_an_error_is_not_lost(fake_graph: FakeGraph) -> None:
+    fake_graph.serve(Echo, "/echo", echo)
+    async with fake_graph.session(limits=Limits(in_flight=1)) as session:
+        with fake_graph.hold_requests():
+            first = session.start(Echo, "/echo", Echo.Request(0))
+            tasks = [asyncio.create_task(ask(session, n)) for n in (1, 2)]
+            await until(lambda: session.pool.statistics().waiting == 2)
+            tasks[0].cancel()
+        await first
+        assert await tasks[1] == 2
+        assert await ask(session, 3) == 3
+
+
+async def test_a_message_changed_after_start_was_sent_as_it_was(fake_graph: FakeGraph) -> None:
+    server = fake_graph.serve(Echo, "/echo", echo)
+    async with fake_graph.session(limits=Limits(in_flight=2)) as session:
+        await session.wait_for_service(Echo, "/echo")
+        request = Echo.Request()
+        tasks = []
+        for number in range(4):  # Two are sent, two have to wait.
+            request.value = [number]
+            tasks.append(session.start(Echo, "/echo", request))
+            request.value.clear()
+            request.value = None
+        answers = [(await task).value for task in tasks]
+    # Those that are sent at once are converted by rclpy; the fake port keeps the message itself.
+    assert answers[2:] == [[2], [3]]
+    assert len(server.received) == 4
+
+
+async def test_a_retried_message_is_copied(fake_graph: FakeGraph) -> None:
+    server = fake_graph.serve(Echo, "/echo", echo)
+    async with fake_graph.session() as session:
+        await session.wait_for_service(Echo, "/echo")
+        request = Echo.Request("first")
+        with fake_graph.drop_responses():
+            task = session.start(Echo, "/echo", request, retry=Retry(10, TICK, 1.0))
+            request.value = "changed"
+            await until(lambda: server.received)
+        assert (await task).value == "first"
+
+
+async def test_callers_share_what_clients_there_are_if_no_more_can_be_created(
+    fake_graph: FakeGraph, caplog: pytest.LogCaptureFixture
+) -> None:
+    fake_graph.serve(Echo, "/echo", echo)
+    async with fake_graph.session(limits=Limits(clients=4, in_flight=1)) as session:
+        assert await ask(session, 0) == 0
+        node: Any = session.node
+
+        def refuse(*_: object) -> None:
+            raise OSError(24, "Too many open files")
+
+        node.open_client, open_client = refuse, node.open_client
+        with caplog.at_level(logging.WARNING, logger="rosasync"):
+            assert await asyncio.gather(*(ask(session, n) for n in range(9))) == list(range(9))
+        assert [r.getMessage().partition(":")[0] for r in caplog.records] == ["/echo"]
+        assert "no further client" in caplog.text
+        node.open_client = open_client
+        await asyncio.gather(*(ask(session, n) for n in range(9)))
+        assert session.pool.statistics().clients == 4
+
+
+async def test_without_any_client_the_error_is_the_callers(fake_graph: FakeGraph) -> None:
+    fake_graph.serve(Echo, "/echo", echo)
+    async with fake_graph.session() as session:
+        node: Any = session.node
+
+        def refuse(*_: object) -> None:
+            raise OSError(24, "Too many open files")
+
+        node.open_client, open_client = refuse, node.open_client
+        with pytest.raises(OSError, match="Too many"):
+            await ask(session, 1)
+        node.open_client = open_client
+        assert await ask(session, 1) == 1
+
+
+def raise_destroyed(*_: object) -> Any:
+    raise PortDestroyed("destroyed")
+
+
+async def test_a_client_destroyed_by_other_means_is_replaced(fake_graph: FakeGraph) -> None:
+    fake_graph.serve(Echo, "/echo", echo)
+    async with fake_graph.session() as session:
+        assert await ask(session, 0) == 0
+        (client,) = session.pool.service(Echo, "/echo", None).clients
+        client.send = raise_destroyed
+        with pytest.raises(ContextShutdown, match="/echo: the client was destroyed"):
+            await ask(session, 1)
+        assert await ask(session, 2) == 2
+        total = session.pool.statistics()
+        assert (total.clients, total.created, total.in_flight) == (1, 2, 0)
+
+
+async def test_calls_of_a_client_destroyed_by_other_means_end(
+    fake_graph: FakeGraph, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fake_graph.serve(Echo, "/echo", echo)
+    async with fake_graph.session(limits=Limits(in_flight=1)) as session:
+        assert await ask(session, 0) == 0
+        with fake_graph.hold_requests():
+            out = session.start(Echo, "/echo", Echo.Request(1))
+            waiting = session.start(Echo, "/echo", Echo.Request(2))
+            monkeypatch.setattr(the_client(fake_graph), "ready", raise_destroyed)
+            fake_graph.changed()
+            with pytest.raises(ContextShutdown):
+                await out
+        assert (await waiting).value == 2
+
+
+@pytest.mark.parametrize("limits", [Limits(idle=0.0), Limits(idle=TICK, clients=3, in_flight=1)])
+async def test_idle_clients_are_evicted_and_come_back(
+    fake_graph: FakeGraph, limits: Limits
+) -> None:
+    fake_graph.serve(Echo, "/echo", echo)
+    async with fake_graph.session(limits=limits) as session:
+        for _ in range(2):
+            await asyncio.gather(*(ask(session, n) for n in range(5)))
+            await until(lambda: session.pool.statistics().clients == 0)
+
+
+async def test_a_client_that_waits_for_a_server_is_not_evicted(fake_graph: FakeGraph) -> None:
+    async with fake_graph.session(limits=Limits(idle=TICK / 10)) as session:
+        task = session.start(Echo, "/echo", Echo.Request(1), timeout=LIMIT)
+        await asyncio.sleep(2 * TICK)
+        assert session.pool.statistics().created == 1
+        fake_graph.serve(Echo, "/echo", echo)
+        assert (await task).value == 1
+
+
+async def test_a_server_of_another_type_does_not_hide_that_the_last_has_gone(
+    fake_graph: FakeGraph,
+) -> None:
+    class Other:
+        class Request: ...
+
+        class Response: ...
+
+    server = fake_graph.serve(Echo, "/echo", echo)
+    fake_graph.serve(Other, "/echo", lambda request: Other.Response())
+    async with fake_graph.session() as session:
+        with fake_graph.drop_responses():
+            task = session.start(Echo, "/echo", Echo.Request(1), timeout=None)
+            await until(lambda: server.received)
+            server.close()
+            with pytest.raises(ServerGone):
+                await asyncio.wait_for(task, LIMIT)
+
+
+async def test_a_server_of_another_type_is_not_warned_of(
+    fake_graph: FakeGraph, caplog: pytest.LogCaptureFixture
+) -> None:
+    class Other:
+        class Request: ...
+
+        class Response: ...
+
+    fake_graph.serve(Echo, "/echo", echo)
+    fake_graph.serve(Other, "/echo", lambda request: Other.Response())
+    async with fake_graph.session() as session:
+        with caplog.at_level(logging.WARNING, logger="rosasync"):
+            assert await ask(session, 1) == 1
+    assert not caplog.records
