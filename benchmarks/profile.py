@@ -50,20 +50,20 @@ STAGES = {
     ("send", "sent"): Stage(MIDDLEWARE, "`send_request`: converts and writes the request"),
     ("sent", "timer"): Stage(OURS, "registers the sequence number"),
     ("timer", "armed"): Stage(ASYNCIO, "the deadline's timer"),
-    ("armed", "select"): Stage(ASYNCIO, "the task suspends, the loop looks for what is due"),
+    ("armed", "select"): Stage(ASYNCIO, "the task suspends, the loop checks its timers"),
     ("sent", "select"): Stage(
-        ASYNCIO, "the number is registered, the task suspends, the loop looks for what is due"
+        ASYNCIO, "the number is registered, the task suspends, the loop checks its timers"
     ),
-    ("select", "selected"): Stage(ASLEEP, "to the server, its work, and back; the wake-up"),
+    ("select", "selected"): Stage(ASLEEP, "the server receives, works and responds; the loop wakes up"),
     ("selected", "read"): Stage(ASYNCIO, "the loop calls the reader"),
     ("read", "counted"): Stage(KERNEL, "reads the eventfd"),
-    ("counted", "take"): Stage(OURS, "finds the client that waits"),
+    ("counted", "take"): Stage(OURS, "finds the waiting client"),
     ("take", "taken"): Stage(MIDDLEWARE, "`take_response`: takes and converts the response"),
-    ("taken", "deliver"): Stage(OURS, "finds the request that is answered"),
-    ("deliver", "delivered"): Stage(OURS, "completes the future, gives the place back"),
-    ("delivered", "again"): Stage(ASYNCIO, "the reader returns, the loop goes round"),
-    ("again", "polled"): Stage(KERNEL, "the loop looks for other events"),
-    ("polled", "answer"): Stage(ASYNCIO, "wakes the task up, which counts and returns"),
+    ("taken", "deliver"): Stage(OURS, "finds the answered request"),
+    ("deliver", "delivered"): Stage(OURS, "completes the future, frees the place"),
+    ("delivered", "again"): Stage(ASYNCIO, "the reader returns, the loop starts its next turn"),
+    ("again", "polled"): Stage(KERNEL, "the loop polls for other events"),
+    ("polled", "answer"): Stage(ASYNCIO, "the task wakes up, counts and returns"),
 }
 """By the names of the stamps at both ends, in order."""
 
