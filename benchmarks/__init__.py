@@ -1,5 +1,5 @@
-"""How fast are ROS 2 service calls from Python, this library's and everybody else's?
+"""Measures ROS 2 service calls from Python, with rosasync and with its alternatives.
 
-``python -m benchmarks --help`` says what can be measured; each contestant is one file in
+``python -m benchmarks --help`` lists what can be measured. Each contestant is one file in
 ``benchmarks/contestants``.
 """

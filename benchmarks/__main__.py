@@ -24,23 +24,24 @@ WIDTH = 180
 
 Quick = Annotated[bool, typer.Option("--quick", help="Fewer calls and rounds.")]
 Rounds = Annotated[int | None, typer.Option(min=1, help=f"{ROUNDS}, or {QUICK_ROUNDS} if quick.")]
-Json = Annotated[Path | None, typer.Option("--json", help="Write the raw samples here.")]
+Json = Annotated[Path | None, typer.Option("--json", help="Write the raw samples to this file.")]
 Pin = Annotated[
-    bool | None, typer.Option(help="Half of the cores for the server; by default if four or more.")
+    bool | None,
+    typer.Option(help="Reserve half of the cores for the server; default with four or more cores."),
 ]
-Chosen = Annotated[str, typer.Option("--contestants", help="Only these: a,b,c.")]
+Chosen = Annotated[str, typer.Option("--contestants", help="Only these contestants: a,b,c.")]
 
 SUITE_COMMANDS = {
-    "latency": "Time of a call, calls at once, idle clients, idle CPU and memory.",
-    "throughput": "Calls per second of 1, 8, 64 and 512 callers.",
+    "latency": "The time of a call, calls at once, idle clients, idle CPU and memory.",
+    "throughput": "The calls per second of 1, 8, 64 and 512 callers.",
     "scale": "Many services, idle clients, large responses and slow servers.",
-    "hosts": "A server on another host, a network namespace; needs root.",
-    "targets": "The least of everything that shows whether the targets are reached.",
-    "ticks": "Ticks of behaviour trees: what they cost, and how soon they send and see.",
-    "flood": "Calls lost by a busy client while another process floods its server.",
-    "servers": "A rosasync server beside a stock one, driven by the same client.",
-    "idle": "CPU of a client that calls nothing.",
-    "memory": "Memory after 100,000 calls, above that after 10,000.",
+    "hosts": "A server on another host, which is a network namespace; needs root.",
+    "targets": "The fewest measurements that show whether the targets are met.",
+    "ticks": "Ticks of behaviour trees: their cost, and how fast they send and see responses.",
+    "flood": "Calls that a busy client loses while another process floods its server.",
+    "servers": "A rosasync server compared with a stock server, with the same client.",
+    "idle": "The CPU use of a client that makes no calls.",
+    "memory": "The growth of memory from 10,000 to 100,000 calls.",
 }
 
 app = typer.Typer(help=__doc__, no_args_is_help=True, pretty_exceptions_enable=False)
@@ -66,7 +67,7 @@ for _suite, _text in SUITE_COMMANDS.items():
 
 @app.command()
 def allocations(quick: Quick = False, rounds: Rounds = None, json: Json = None) -> None:
-    """Python objects and bytes of a call and of a request, and what stays of many."""
+    """The Python objects and bytes of a call and of a request, and how many stay allocated."""
     isolate()
     rounds = rounds or (1 if quick else ALLOCATION_ROUNDS)
     settings = {"suites": ["allocations"], "quick": quick, "rounds": rounds, "pin": False}
@@ -77,7 +78,7 @@ def allocations(quick: Quick = False, rounds: Rounds = None, json: Json = None) 
 
 add_command(
     "all",
-    "Everything there is to measure.",
+    "All measurements.",
     [name for name in SUITES if name != "targets"],
     and_allocations=True,
 )
@@ -85,14 +86,14 @@ add_command(
 
 @app.command()
 def profile(
-    calls: Annotated[int, typer.Option(min=250, help="With the stamps, and as many without.")] = (
-        20_000
-    ),
+    calls: Annotated[
+        int, typer.Option(min=250, help="Calls with timestamps, and as many without.")
+    ] = (20_000),
     update: Annotated[
-        Path | None, typer.Option(exists=True, help="A page to write the table into.")
+        Path | None, typer.Option(exists=True, help="Write the table into this page.")
     ] = None,
 ) -> None:
-    """Where the time of one call goes, between await and its answer."""
+    """How the time of one call is spent, between await and the response."""
     from benchmarks import profile
 
     isolate()
@@ -105,9 +106,9 @@ def profile(
 @app.command()
 def report(
     files: Annotated[list[Path], typer.Argument(exists=True, help="Results saved with --json.")],
-    out: Annotated[Path, typer.Option(help="The folder of the documentation.")] = Path("docs"),
+    out: Annotated[Path, typer.Option(help="The documentation's folder.")] = Path("docs"),
 ) -> None:
-    """Turn saved results into docs/benchmarks.md with its plots."""
+    """Write docs/benchmarks.md and its plots from saved results."""
     from benchmarks.report import write_report
 
     typer.echo(write_report(Results.load(files), out))
@@ -144,7 +145,7 @@ def measure(
         if and_allocations:
             look_at_allocations(results, quick, 1 if quick else ALLOCATION_ROUNDS)
     except KeyboardInterrupt:
-        console.print("interrupted: these are the rounds that ended")
+        console.print("interrupted: these are the completed rounds")
     finish(results, json)
 
 
@@ -160,7 +161,7 @@ def finish(results: Results, json: Path | None) -> None:
 
 
 def make_console() -> Console:
-    """The terminal, or where there is none, lines wide enough for a table."""
+    """Return a console for the terminal, or one that is wide enough for a table."""
     console = Console()
     return console if console.is_terminal else Console(width=WIDTH)
 

@@ -1,9 +1,9 @@
-"""What a call and a request cost in memory: ``python -m benchmarks allocations``.
+"""The memory use of a call and of a request: ``python -m benchmarks allocations``.
 
-The study of rclcpp services asks where a service call allocates. In Python everything does; so the
-questions are how much a call holds while it is out, how much a call or request needs at its peak,
-and whether any of it stays. As a program (``python -m benchmarks.allocations KIND``) this is the
-process that is looked at.
+The study of rclcpp services asks where a service call allocates. In Python, everything allocates.
+So this module measures how much memory an outstanding call holds, how much a call or a request
+needs at its peak, and whether any of it stays allocated. Run as a program
+(``python -m benchmarks.allocations KIND``), it is the measured process.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from benchmarks.work import READY_TIMEOUT, Work, load_type, make_request
 __all__ = ["allocation_rows", "measure_allocations", "show_allocations"]
 
 OUT = 200
-"""Calls that are out at once while what they hold is counted; they last ``SLOW`` seconds."""
+"""Number of outstanding calls while their memory is counted; each lasts ``SLOW`` seconds."""
 SLOW = 2.0
 PEAK_CALLS = 200
 WARM = 10_000
@@ -59,19 +59,19 @@ Found = dict[str, dict[str, Row]]
 
 
 class Caller(ABC):
-    """Calls that are made in the process looked at."""
+    """Makes calls in the measured process."""
 
     @abstractmethod
     def call(self, calls: int) -> None:
-        """Makes so many calls, one at a time."""
+        """Make this many calls, one at a time."""
 
     @abstractmethod
     def hold(self, calls: int, look: Callable[[], None]) -> None:
-        """Makes so many calls at once, looks while they are out, and awaits them."""
+        """Make this many calls at once, call ``look`` meanwhile, and await the calls."""
 
     @abstractmethod
     def pending(self) -> int:
-        """How many requests are kept an entry for."""
+        """Return the number of requests that have an entry."""
 
 
 class RosasyncCaller(Caller):
@@ -153,7 +153,7 @@ CALLERS: dict[str, Callable[[Work, ExitStack], Caller]] = {
 
 
 class Subject:
-    """The process looked at: a client, or a server that another process calls."""
+    """The measured process: a client, or a server that another process calls."""
 
     def __init__(self, kind: str) -> None:
         self._kind = kind
@@ -232,14 +232,14 @@ def tracing() -> Iterator[None]:
 
 
 def traced() -> tuple[int, int]:
-    """Blocks and bytes that Python has allocated since the tracing began, and not freed."""
+    """Return the blocks and bytes that were allocated since tracing began and not freed."""
     gc.collect()
     traces = tracemalloc.take_snapshot().traces
     return len(traces), sum(trace.size for trace in traces)
 
 
 def measure_allocations(results: Results, *, quick: bool, rounds: int, progress: Progress) -> None:
-    """Looks at every client and server, each in a process of its own, once in each round."""
+    """Measure every client and server, each in its own process, once in each round."""
     calls = QUICK_CALLS if quick else CALLS
     task = progress.add_task("", total=rounds * (len(CLIENTS) + len(SERVED)))
     for _ in range(rounds):
@@ -281,7 +281,7 @@ def _measure_server(kind: str, work: Work, calls: int) -> Row:
 
 
 def _look(subject: Child, call: Callable[..., Any], calls: int) -> Row:
-    """The peak of a call, then what is left after many."""
+    """Measure the peak of a call, then what stays allocated after many calls."""
     ask = partial(subject.ask, timeout=PATIENCE)
     call(calls=PEAK_CALLS)
     ask("peak_begin")
@@ -302,7 +302,7 @@ def _look(subject: Child, call: Callable[..., Any], calls: int) -> Row:
 
 
 COLUMNS: dict[str, tuple[str, str]] = {
-    "blocks": ("blocks held by a call that is out", "{:.1f}"),
+    "blocks": ("blocks held by an outstanding call", "{:.1f}"),
     "bytes": ("bytes held by it", "{:,.0f}"),
     "peak": ("bytes at the peak", "{:,.0f}"),
     "kept_blocks": ("blocks kept", "{:+,.0f}"),
@@ -312,7 +312,7 @@ COLUMNS: dict[str, tuple[str, str]] = {
 
 
 def allocation_rows(results: Results, part: str) -> tuple[list[str], list[list[str]]]:
-    """Heading and rows for ``clients`` or ``servers``: the medians over the rounds."""
+    """Return the heading and the rows for ``clients`` or ``servers``: medians over the rounds."""
     labels = CLIENTS if part == "clients" else SERVED
     found = [measured[part] for measured in results.allocations]
     keys = [key for key in COLUMNS if any(key in row for row in found[0].values())]
@@ -329,7 +329,7 @@ def allocation_rows(results: Results, part: str) -> tuple[list[str], list[list[s
 
 
 def show_allocations(results: Results) -> Iterator[Table]:
-    """A table for the clients and one for the servers."""
+    """Return a table for the clients and one for the servers."""
     for part in results.allocations[0] if results.allocations else ():
         heading, body = allocation_rows(results, part)
         table = Table(title=f"[bold]{part}[/]", title_justify="left", box=SIMPLE)

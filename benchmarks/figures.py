@@ -1,4 +1,4 @@
-"""Figures from turns: percentiles, rates, costs, and ratios with their spread."""
+"""Computes figures from turns: percentiles, rates, costs, and ratios with their spread."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ __all__ = ["METRICS", "Metric", "Ratio", "brief", "figure", "pooled_percentile",
 
 @dataclass(frozen=True)
 class Metric:
-    """A figure of one turn, as a column is headed; None where the turn does not have it."""
+    """A figure of one turn, with its column heading; None if the turn does not have it."""
 
     label: str
     of: Callable[[Turn], float | None]
     over: Callable[[list[float]], float] = statistics.median
-    """Makes one figure of the rounds'."""
+    """Combines the figures of all rounds into one."""
 
 
 def _percentile(q: float) -> Callable[[Turn], float | None]:
@@ -79,14 +79,14 @@ class Ratio:
 
 
 def brief(value: float) -> str:
-    """A number in as many digits as are worth reading."""
+    """Format a number with about three significant digits."""
     if value >= 100:
         return f"{value:,.0f}"
     return f"{value:.1f}" if value >= 10 else f"{value:.2f}"
 
 
 def figure(turns: Iterable[Turn], metric: str) -> float | None:
-    """The median over the rounds; of what may not happen at all, the most."""
+    """Return the median over the rounds; for losses, the maximum."""
     found = METRICS[metric]
     values = [
         value for turn in turns if turn.outcome == "ok" and (value := found.of(turn)) is not None
@@ -95,13 +95,13 @@ def figure(turns: Iterable[Turn], metric: str) -> float | None:
 
 
 def pooled_percentile(turns: Iterable[Turn], q: float) -> float | None:
-    """A percentile in µs of all rounds' samples together, as rare ones need."""
+    """Return a percentile in µs of all rounds' samples together, as high percentiles need."""
     samples = [sample for turn in turns for sample in turn.samples]
     return float(np.percentile(samples, q)) / 1e3 if samples else None
 
 
 def ratio(turns: Iterable[Turn], others: Iterable[Turn], metric: str) -> Ratio | None:
-    """Of each round in which both have the figure; None where there is no such round."""
+    """Return the ratio over the rounds in which both have the figure; None without such rounds."""
     of = METRICS[metric].of
     below = {turn.round: of(turn) for turn in others if turn.outcome == "ok"}
     ratios = [

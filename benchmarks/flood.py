@@ -1,4 +1,4 @@
-"""A process that floods one service until the runner has enough: ``python -m benchmarks.flood``."""
+"""Floods one service until the runner stops it: ``python -m benchmarks.flood``."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from benchmarks.pipes import answer_lines
 from benchmarks.work import Work
 
 TURN = 1.0
-"""Seconds between looks at whether it is to end."""
+"""Seconds between checks for the end."""
 PATIENCE = 0.1
-"""Seconds after which a request is given up, and the next one sent."""
+"""Seconds after which a request counts as lost and the next one is sent."""
 
 
 class Flooding(WaitSet):
-    """Does not wait long for what is lost: it has others to send."""
+    """Gives a lost request up early, to send the next one."""
 
     patience = PATIENCE
 
@@ -27,7 +27,7 @@ class Flooding(WaitSet):
 
 
 class Flood:
-    """What the runner may ask for: ``start``, ``stop``."""
+    """Answers the runner's requests: ``start`` and ``stop``."""
 
     def __init__(self) -> None:
         self._clients = Flooding()
@@ -39,7 +39,7 @@ class Flood:
         return answer
 
     def do_start(self, work: dict[str, Any], callers: int) -> dict[str, Any]:
-        """Returns when the first turn is over, so that the server is under way."""
+        """Start, and return after the first turn, when the server is busy."""
         self._clients.setup(Work.from_json(work))
         self._enough.clear()
         self._turn(callers)

@@ -1,4 +1,4 @@
-"""Two hosts on one machine: network namespaces joined by a virtual cable, gone with the run."""
+"""Two hosts on one machine: temporary network namespaces, joined by a virtual cable."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ __all__ = ["Hosts", "NoHosts"]
 
 ENVIRONMENT = {
     "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",
-    # The namespaces share one kernel's memory, which two machines would not.
+    # The namespaces share memory through one kernel, unlike two machines.
     "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
 }
 
 
 class NoHosts(Exception):
-    """This machine lets the run make no network namespaces; the text says why."""
+    """Network namespaces cannot be created on this machine; the message says why."""
 
 
 class Hosts:
     """A host for the server and one for the contestants.
 
     Raises:
-        NoHosts: on entering, where there is no iproute2, or no right to use it.
+        NoHosts: on entering, if iproute2 is missing or must not be used.
     """
 
     environment = ENVIRONMENT
@@ -36,7 +36,7 @@ class Hosts:
 
     def __enter__(self) -> Hosts:
         if shutil.which("ip") is None:
-            raise NoHosts("there is no `ip` (iproute2)")
+            raise NoHosts("`ip` is missing: install iproute2")
         if os.geteuid() != 0:
             raise NoHosts("network namespaces need root")
         with self._stack:
@@ -64,12 +64,12 @@ class Hosts:
 
     @property
     def on_server(self) -> list[str]:
-        """What a command begins with that is to run on the server's host."""
+        """The prefix of a command that runs on the server's host."""
         return ["ip", "netns", "exec", self._names[0]]
 
     @property
     def on_client(self) -> list[str]:
-        """The same for the contestants' host."""
+        """The prefix of a command that runs on the contestants' host."""
         return ["ip", "netns", "exec", self._names[1]]
 
 

@@ -1,4 +1,4 @@
-"""The machine and the versions a result belongs to."""
+"""The machine and the versions to which a result belongs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PACKAGES = (
 
 
 def describe_machine() -> dict[str, Any]:
-    """The hardware and its load before the run, the system, and the versions of all contestants."""
+    """Describe the hardware, its load, the system, and the versions of all contestants."""
     from rclpy.utilities import get_rmw_implementation_identifier
 
     return {

@@ -1,4 +1,4 @@
-"""What a process has used: CPU time and context switches."""
+"""Measures the CPU time, context switches and memory of a process."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["Usage", "resident_bytes", "usage"]
 
 @dataclass(frozen=True)
 class Usage:
-    """CPU time in ns and context switches, of a process and of the children it has waited for."""
+    """CPU time in ns and context switches of a process and of the children it waited for."""
 
     cpu: int = 0
     voluntary: int = 0
@@ -32,7 +32,7 @@ class Usage:
 
 
 def usage() -> Usage:
-    """What this process has used so far, all its threads and ended children included."""
+    """Return the usage of this process so far, with all threads and ended children."""
     both = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return Usage(
         round(sum(used.ru_utime + used.ru_stime for used in both) * 1e9),
@@ -42,7 +42,7 @@ def usage() -> Usage:
 
 
 def resident_bytes() -> int:
-    """The memory this process holds, after giving back what it does not need."""
+    """Return the resident memory of this process, after it has released unused memory."""
     gc.collect()
     ctypes.CDLL(None).malloc_trim(0)
     pages = int(Path("/proc/self/statm").read_text().split()[1])

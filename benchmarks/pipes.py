@@ -1,4 +1,4 @@
-"""A child process that answers JSON lines, seen from both ends."""
+"""Both ends of a child process that answers JSON lines."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ class Hung(ChildError):
 
 
 class Child:
-    """A Python module run as a process of its own, asked for one thing at a time.
+    """A Python module that runs as a child process and answers one request at a time.
 
     Args:
-        module: run with ``python -m``, and `args`.
-        cores: it is bound to these.
-        prefix: the command it is run by.
-        environment: of its own, above this process's.
+        module: the module, run with ``python -m`` and `args`.
+        cores: the cores to which the process is bound.
+        prefix: the start of the command, before the interpreter.
+        environment: variables to add to this process's environment.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class Child:
         environment: Mapping[str, str] | None = None,
     ) -> None:
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the child
-        # A session of its own: Ctrl-C is the parent's to handle, and a kill reaches grandchildren.
+        # Its own session: the parent handles Ctrl-C, and a kill reaches grandchildren.
         self._process = subprocess.Popen(
             [*prefix, sys.executable, "-m", module, *args],
             env={**os.environ, **(environment or {})},
@@ -68,10 +68,10 @@ class Child:
             os.sched_setaffinity(self._process.pid, cores)
 
     def ask(self, do: str, *, timeout: float, **message: Any) -> Message:
-        """Sends one message and returns its answer.
+        """Send one message and return the answer.
 
         Raises:
-            Hung: no answer within `timeout` seconds. The child is of no use any more: kill it.
+            Hung: no answer within `timeout` seconds. Kill the child, which cannot be used again.
             ChildError: the answer is an error, or the child has ended.
         """
         assert self._process.stdin is not None
@@ -86,7 +86,7 @@ class Child:
         return answer
 
     def close(self, timeout: float = 10.0) -> None:
-        """Ends the child by closing its input, or by force where it does not listen."""
+        """End the child by closing its input, or kill it if it does not end."""
         assert self._process.stdin is not None
         with suppress(BrokenPipeError):
             self._process.stdin.close()
@@ -95,7 +95,7 @@ class Child:
         self.kill()
 
     def kill(self) -> None:
-        """Ends the child and everything it started."""
+        """Kill the child and every process it started."""
         with suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
@@ -138,10 +138,10 @@ class Child:
 
 
 def answer_lines(answer: Callable[[Message], Message]) -> None:
-    """Answers every line of standard input with a line of standard output, until the input ends.
+    """Answer each line of standard input with a line on standard output, until the input ends.
 
-    What else the process prints goes to standard error. An input that ends while `answer` is stuck
-    ends the process after 5 s.
+    All other output of the process goes to standard error. If the input ends while `answer` is
+    stuck, the process ends after 5 s.
     """
     requests, output = os.dup(0), os.dup(1)
     with open(os.devnull, "rb") as nothing:
@@ -161,7 +161,7 @@ def answer_lines(answer: Callable[[Message], Message]) -> None:
 
 
 def describe(exc: BaseException) -> str:
-    """An exception in one line; of a group, the first that is none."""
+    """Describe an exception in one line; for a group, its first exception that is not a group."""
     while isinstance(exc, BaseExceptionGroup):
         exc = exc.exceptions[0]
     return f"{type(exc).__name__}: {exc}"

@@ -1,4 +1,4 @@
-"""Where the time of one call goes, between ``await`` and its answer: stamps along its path."""
+"""Measures how the time of one call is spent, with timestamps along its path."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ BEGIN, END = "<!-- profile -->", "<!-- /profile -->"
 PATIENCE = 10.0
 WARM_UP = 500
 ROUND = 250
-"""Calls after which stamped and unstamped ones alternate, so that both meet the same machine."""
+"""Calls with and without timestamps alternate in rounds of this many calls."""
 
 
 @dataclass(frozen=True)
 class Stage:
-    """What happens between two stamps, and whose time it is."""
+    """What happens between two timestamps, and which part of the system spends the time."""
 
     whose: str
     what: str
@@ -50,22 +50,24 @@ STAGES = {
     ("send", "sent"): Stage(MIDDLEWARE, "`send_request`: converts and writes the request"),
     ("sent", "timer"): Stage(OURS, "registers the sequence number"),
     ("timer", "armed"): Stage(ASYNCIO, "the deadline's timer"),
-    ("armed", "select"): Stage(ASYNCIO, "the task suspends, the loop looks for what is due"),
+    ("armed", "select"): Stage(ASYNCIO, "the task suspends, the loop checks its timers"),
     ("sent", "select"): Stage(
-        ASYNCIO, "the number is registered, the task suspends, the loop looks for what is due"
+        ASYNCIO, "the number is registered, the task suspends, the loop checks its timers"
     ),
-    ("select", "selected"): Stage(ASLEEP, "to the server, its work, and back; the wake-up"),
+    ("select", "selected"): Stage(
+        ASLEEP, "the server receives, works and responds; the loop wakes up"
+    ),
     ("selected", "read"): Stage(ASYNCIO, "the loop calls the reader"),
     ("read", "counted"): Stage(KERNEL, "reads the eventfd"),
-    ("counted", "take"): Stage(OURS, "finds the client that waits"),
+    ("counted", "take"): Stage(OURS, "finds the waiting client"),
     ("take", "taken"): Stage(MIDDLEWARE, "`take_response`: takes and converts the response"),
-    ("taken", "deliver"): Stage(OURS, "finds the request that is answered"),
-    ("deliver", "delivered"): Stage(OURS, "completes the future, gives the place back"),
-    ("delivered", "again"): Stage(ASYNCIO, "the reader returns, the loop goes round"),
-    ("again", "polled"): Stage(KERNEL, "the loop looks for other events"),
-    ("polled", "answer"): Stage(ASYNCIO, "wakes the task up, which counts and returns"),
+    ("taken", "deliver"): Stage(OURS, "finds the answered request"),
+    ("deliver", "delivered"): Stage(OURS, "completes the future, frees the place"),
+    ("delivered", "again"): Stage(ASYNCIO, "the reader returns, the loop starts its next turn"),
+    ("again", "polled"): Stage(KERNEL, "the loop polls for other events"),
+    ("polled", "answer"): Stage(ASYNCIO, "the task wakes up, counts and returns"),
 }
-"""By the names of the stamps at both ends, in order."""
+"""The stages in order, by the names of the timestamps at both ends."""
 
 
 @dataclass
@@ -73,9 +75,11 @@ class Profile:
     """Medians in µs.
 
     Attributes:
-        stages: each stage's, in order.
-        stamped: of whole calls with the stamps, and `plain` of those without.
-        calls: that took the path of most calls, and `off_path` those left out, which did not.
+        stages: the median of each stage, in order.
+        stamped: the median of calls with timestamps.
+        plain: the median of calls without timestamps.
+        calls: number of calls on the most common path.
+        off_path: number of calls on other paths, which are ignored.
     """
 
     stages: dict[Stage, float]
@@ -85,7 +89,7 @@ class Profile:
     off_path: int
 
     def shares(self) -> dict[str, float]:
-        """The time of each party together."""
+        """Return the total time of each part of the system."""
         shares: defaultdict[str, float] = defaultdict(float)
         for stage, median in self.stages.items():
             shares[stage.whose] += median
@@ -93,7 +97,7 @@ class Profile:
 
     @property
     def summary(self) -> str:
-        """What the stages come to, in a sentence or two."""
+        """The totals, in two sentences."""
         shares = ", ".join(f"{whose} {us:.1f} µs" for whose, us in self.shares().items())
         return (
             f"Together: {shares}. A whole call took {self.plain:.1f} µs, and {self.stamped:.1f} "
@@ -102,7 +106,7 @@ class Profile:
 
 
 def table(found: Profile) -> Table:
-    """The stages, for the terminal."""
+    """Return the stages as a table for the terminal."""
     table = Table(caption=found.summary, caption_justify="left", box=SIMPLE)
     for column in ("", "whose", "µs"):
         table.add_column(column, justify="right" if column == "µs" else "left")
@@ -112,7 +116,7 @@ def table(found: Profile) -> Table:
 
 
 def updated(page: str, found: Profile, machine: dict[str, Any]) -> str:
-    """A Markdown page, with the stages between its marks.
+    """Return a Markdown page with the stages between its marks.
 
     Raises:
         ValueError: the page does not have the marks.
@@ -130,7 +134,7 @@ def updated(page: str, found: Profile, machine: dict[str, Any]) -> str:
 
 
 class Stamps:
-    """The names and times of one call after the other, in ns; costs what it measures a little."""
+    """Records the names and times of the timestamps of a call, in ns, at a small cost."""
 
     def __init__(self) -> None:
         self.on = False
@@ -141,7 +145,7 @@ class Stamps:
             self.taken.append((name, time.perf_counter_ns()))
 
     def around(self, function: Callable[..., T], before: str, after: str) -> Callable[..., T]:
-        """The function, stamped before and after."""
+        """Return the function with a timestamp before and after it."""
 
         def stamped(*args: Any) -> T:
             self.add(before)
@@ -153,7 +157,7 @@ class Stamps:
 
 
 class StampedSelector(selectors.EpollSelector):
-    """Tells a sleep from a look: after a response is delivered, the loop does not sleep."""
+    """Distinguishes sleeping from polling: after a delivered response, the loop does not sleep."""
 
     def __init__(self, stamps: Stamps) -> None:
         super().__init__()
@@ -169,7 +173,7 @@ class StampedSelector(selectors.EpollSelector):
 
 @dataclass
 class StampedLoop:
-    """Makes loops whose selector and timers are stamped; not every call makes a timer."""
+    """Creates loops with timestamps in their selector and timers; not every call sets a timer."""
 
     stamps: Stamps = field(default_factory=Stamps)
 
@@ -193,7 +197,7 @@ class StampedLoop:
 
 
 def profile(calls: int) -> Profile:
-    """Measures calls one at a time, on asyncio and the direct bridge, to a bare server."""
+    """Measure calls, one at a time, on asyncio and the direct bridge, to a bare server."""
     work = Work(server="lean", srv_name="/bench/profile")
     loop_factory = StampedLoop()
     server = Child("benchmarks.server")
@@ -230,7 +234,7 @@ async def _measure(work: Work, calls: int, stamps: Stamps) -> Profile:
 
 @contextmanager
 def _stamping(session: rosasync.Session, stamps: Stamps) -> Iterator[None]:
-    """Puts stamps where the session's one client touches the middleware, for one call."""
+    """Add timestamps to the session's one client and its middleware calls, for one call."""
     pool: Any = session.pool
     (service,) = pool._services.values()
     (client,) = service.clients
@@ -249,11 +253,11 @@ def _stamping(session: rosasync.Session, stamps: Stamps) -> Iterator[None]:
 
 
 def _summary(stamped: list[Sequence[tuple[str, int]]], plain: list[int]) -> Profile:
-    """Of the path that most calls took."""
+    """Return the profile of the most common path."""
     paths = Counter(tuple(name for name, _ in stamps) for stamps in stamped)
     path, calls = paths.most_common(1)[0]
     if unknown := set(pairwise(path)) - set(STAGES):
-        raise RuntimeError(f"stages {unknown} are not known here: the profile is out of date")
+        raise RuntimeError(f"unknown stages {unknown}: update STAGES")
     usual = [stamps for stamps in stamped if tuple(name for name, _ in stamps) == path]
     rows = np.array([[ns for _, ns in stamps] for stamps in usual])
     medians = np.median(np.diff(rows), axis=0) / 1e3

@@ -1,4 +1,4 @@
-"""Saved results as ``docs/benchmarks.md``, with plots of the distributions."""
+"""Writes saved results to ``docs/benchmarks.md``, with plots of the distributions."""
 
 from __future__ import annotations
 
@@ -22,24 +22,25 @@ from benchmarks.targets import judge
 __all__ = ["write_plots", "write_report"]
 
 POINTS = 400
-"""Points of a curve: close enough to the samples, and a plot that can still be mailed."""
+"""Points of a curve: accurate enough, and the plots stay small."""
 
 INTRODUCTION = """\
 # Benchmarks
 
 Written by `python -m benchmarks report`; do not edit.
 
-Contestants alternate in rounds within one run, each in a process of its own, which is set up for a
-turn and taken down after it. Latencies are taken around each call by the caller's own clock: the
-99th and 99.9th percentile are of all rounds' calls together, every other figure is the median over
-the rounds. CPU time and context switches are those of the whole process, middleware threads
-included. A ratio is taken in each round, and given as the median over the rounds with the lowest
-and the highest. The times belong to the machine below; the ratios travel better.
+Contestants alternate in rounds within one run. Each runs in its own process, which is set up before
+a turn and cleaned up after it. Latencies are measured around each call, with the caller's clock.
+The 99th and 99.9th percentiles are those of all rounds' calls together. Every other figure is the
+median over the rounds. CPU time and context switches are those of the whole process, including the
+middleware's threads. A ratio is computed in each round; the tables have its median over the rounds,
+and the lowest and highest value. The times are valid for the machine below. The ratios are more
+portable.
 """
 
 
 def write_report(results: Results, out: Path) -> Path:
-    """Writes the page and its plots under `out`, and returns the page."""
+    """Write the page and its plots to `out`, and return the path of the page."""
     page = out / "benchmarks.md"
     out.mkdir(parents=True, exist_ok=True)
     sections = [INTRODUCTION, *_machine(results), *_targets(results)]
@@ -62,7 +63,7 @@ def write_report(results: Results, out: Path) -> Path:
 
 
 def write_plots(results: Results, folder: Path) -> dict[str, Path]:
-    """Draws a scenario's turns, as PNG and SVG; returns the SVG of each that has any."""
+    """Draw the turns of each scenario as PNG and SVG; return the SVG of each with turns."""
     matplotlib.use("agg")
     matplotlib.rcParams["svg.hashsalt"] = "rosasync"
     folder.mkdir(parents=True, exist_ok=True)
@@ -102,7 +103,7 @@ def _draw(scenario: str, metric: str, contestants: dict[str, list[Turn]]) -> Fig
 
 
 def _spread(axes: Axes, contestants: dict[str, list[Turn]]) -> None:
-    """The middle of each distribution: quartiles, median, and the 1st to the 99th percentile."""
+    """Draw quartiles, median, and the 1st to the 99th percentile of each distribution."""
     samples = [_pooled(turns) for turns in contestants.values()]
     boxes = axes.boxplot(
         samples,
@@ -121,7 +122,7 @@ def _spread(axes: Axes, contestants: dict[str, list[Turn]]) -> None:
 
 
 def _exceeding(axes: Axes, contestants: dict[str, list[Turn]]) -> None:
-    """How many calls took longer than a time: the whole distribution, its tail drawn out."""
+    """Draw the share of calls that took longer than a time, which shows the tail."""
     for i, turns in enumerate(contestants.values()):
         samples = np.sort(_pooled(turns))
         if not len(samples):
@@ -136,7 +137,7 @@ def _exceeding(axes: Axes, contestants: dict[str, list[Turn]]) -> None:
 
 
 def _rounds(axes: Axes, metric: str, contestants: dict[str, list[Turn]]) -> None:
-    """One dot for each round."""
+    """Draw one dot for each round."""
     figure = METRICS[metric]
     for i, turns in enumerate(contestants.values()):
         values = [value for turn in turns if (value := figure.of(turn)) is not None]
@@ -148,7 +149,7 @@ def _rounds(axes: Axes, metric: str, contestants: dict[str, list[Turn]]) -> None
 
 
 def _name_rows(axes: Axes, contestants: Iterable[str]) -> None:
-    """Names the rows in the colours of the curves beside them, which so need no legend."""
+    """Label the rows in the colours of the curves beside them, which then need no legend."""
     names = list(contestants)
     axes.set_yticks(range(1, len(names) + 1), names)
     for i, label in enumerate(axes.get_yticklabels()):
@@ -158,7 +159,7 @@ def _name_rows(axes: Axes, contestants: Iterable[str]) -> None:
 
 
 def _color(i: int) -> Any:
-    """Ten strong colours, then the same ten lighter."""
+    """Return one of ten strong colours, then one of the same ten in a lighter shade."""
     return matplotlib.colormaps["tab20"](2 * i % 20 + i // 10 % 2)
 
 
@@ -174,7 +175,7 @@ def _machine(results: Results) -> Iterator[str]:
         f"{machine['cpu']}, {machine['cores']} cores, load {machine['load']:.1f} before the run, "
         f"Linux {machine['kernel']}, Python {machine['python']}, {machine['middleware']}; "
         f"{versions}. {settings['rounds']} rounds{', quick' if settings['quick'] else ''}"
-        f"{', the server on cores of its own' if settings['pin'] else ''}.\n"
+        f"{', the server on its own cores' if settings['pin'] else ''}.\n"
     )
     yield "## Contestants\n"
     used = {turn.contestant for turn in results.turns}
@@ -183,7 +184,7 @@ def _machine(results: Results) -> Iterator[str]:
         for key, entry in CONTESTANTS.items()
         if key in used
     ]
-    yield _markdown(["", "", "what it is", "burns a core"], body)
+    yield _markdown(["", "", "kind", "keeps a core busy"], body)
 
 
 def _targets(results: Results) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""What was measured: turns, with their raw samples, and the file they are kept in."""
+"""The measurements: turns with their raw samples, and the file that stores them."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ class Turn:
     """One contestant in one round of one scenario; times in ns.
 
     Attributes:
-        outcome: ``hung`` and ``failed`` turns have no samples, and `error` says why.
-        problem: what the first failed call of an otherwise good turn raised.
-        server: what the server process used meanwhile; None where it was not asked.
-        memory: resident bytes, for a scenario that looks at them.
-        added: threads and descriptors, for a scenario that counts them.
+        outcome: ``hung`` and ``failed`` turns have no samples; `error` says why.
+        problem: the error of the first failed call of an otherwise good turn.
+        server: the usage of the server process during the turn; None if it was not measured.
+        memory: resident bytes, if the scenario measures them.
+        added: threads and descriptors, if the scenario counts them.
     """
 
     scenario: str
@@ -62,13 +62,13 @@ class Turn:
 
 @dataclass
 class Results:
-    """Everything one run has measured.
+    """All measurements of one run.
 
     Attributes:
-        scenarios: for each scenario, in the order they ran, what it was: title, group and work.
-        skipped: why a scenario could not be run on this machine.
-        settings: how the run was asked for.
-        allocations: for each round, for ``clients`` and ``servers``, what each kind needed.
+        scenarios: the title, group and work of each scenario, in the order of the run.
+        skipped: for each skipped scenario, why it could not run on this machine.
+        settings: the settings of the run.
+        allocations: for each round, what each kind of ``clients`` and ``servers`` needed.
     """
 
     machine: dict[str, Any]
@@ -104,10 +104,10 @@ class Results:
 
     @classmethod
     def load(cls, paths: Iterable[Path]) -> Results:
-        """Reads one file, or several as one; the machine is the first one's.
+        """Read one or more files and merge them; the machine is that of the first file.
 
         Raises:
-            ValueError: no file, or one of another format.
+            ValueError: there is no file, or a file has another format.
         """
         merged: Results | None = None
         for path in paths:

@@ -1,4 +1,4 @@
-"""Runs scenarios: contestants alternate in rounds, and one that hangs is ended and reported."""
+"""Runs scenarios: contestants alternate in rounds; one that hangs is killed and reported."""
 
 from __future__ import annotations
 
@@ -22,28 +22,28 @@ from benchmarks.work import READY_TIMEOUT, Work
 __all__ = ["Runner", "Scenario"]
 
 PATIENCE = 10.0
-"""Seconds an answer may take beyond what was asked for."""
+"""Seconds that an answer may take beyond the requested duration."""
 HANGS = 2
-"""Hangs in one scenario after which a contestant is not tried again in it."""
+"""Number of hangs in one scenario after which the contestant is not tried again there."""
 SOAK_TIMEOUT = 600.0
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """One kind of work for some contestants.
+    """One kind of work for a set of contestants.
 
     Attributes:
-        key: its name in the results. Scenarios with the same `group` alternate with each other.
-        callers: how many call at once.
-        calls: calls in one turn, or as many as fit into `seconds`.
-        action: ``call``; ``rest`` for `seconds`; ``soak``, whose length is the worker's;
+        key: the name in the results. Scenarios of the same `group` alternate with each other.
+        callers: number of concurrent callers.
+        calls: number of calls in one turn, or fewer if `seconds` run out.
+        action: ``call``; ``rest`` for `seconds`; ``soak``, whose length the worker decides;
             ``tick``, with as many leaves as callers.
-        host: where the server is: on the contestants' machine, or on another one, which is a
-            network namespace.
-        flood: how many requests another process keeps out meanwhile, to the same service.
-        rounds: rounds at most, where turns are long.
-        metric: what its ratios are of.
-        measure: what of the ticks is measured; see `benchmarks.ticking.Ticked`.
+        host: the server's host: the contestants' machine, or another one, which is a network
+            namespace.
+        flood: number of outstanding requests of another process to the same service.
+        rounds: maximum number of rounds, for long turns.
+        metric: the metric of the ratios.
+        measure: the measure of the ticks; see `benchmarks.ticking.Ticked`.
     """
 
     key: str
@@ -65,10 +65,10 @@ class Scenario:
 
 
 class Runner:
-    """The server and the contestants, each in a process of its own.
+    """Runs the server and the contestants, each in its own process.
 
-    A turn sets a contestant up, lets it call, and takes it down again, with a service nobody else
-    uses: while one is measured, the others have neither threads nor clients.
+    A turn sets a contestant up, lets it call a service of its own, and takes it down again. So
+    while one contestant is measured, the others have no threads and no clients.
     """
 
     def __init__(self, rounds: int, pin: bool, results: Results, progress: Progress) -> None:
@@ -96,7 +96,7 @@ class Runner:
                 child.close() if exc_type is None else child.kill()
 
     def run(self, scenarios: Sequence[Scenario]) -> None:
-        """Runs every scenario that can be run here, one group after the other."""
+        """Run every scenario that can run on this machine, one group after the other."""
         for scenario in scenarios:
             self._results.scenarios[scenario.key] = scenario.to_json()
         scenarios = [scenario for scenario in scenarios if self._can_run(scenario)]
@@ -211,7 +211,7 @@ class Runner:
         return self._children[key]
 
     def _end(self, host: str, contestant: str, *, kill: bool = False) -> None:
-        """Ends the processes of a turn that went wrong."""
+        """End the processes of a failed turn."""
         for name in (contestant, "benchmarks.server", "benchmarks.flood"):
             child = self._children.pop((host, name), None)
             if child is not None:
@@ -219,7 +219,7 @@ class Runner:
 
 
 def split_cores() -> tuple[set[int] | None, set[int] | None]:
-    """Cores for the server and for the contestants; None where there is only one."""
+    """Return the cores for the server and for the contestants; None if there is only one core."""
     cores = sorted(os.sched_getaffinity(0))
     if len(cores) < 2:
         return None, None

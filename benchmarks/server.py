@@ -1,7 +1,6 @@
-"""The server process of the benchmarks, asked by the runner: stock rclpy, or a bare loop.
+"""The server process of the benchmarks, controlled by the runner: stock rclpy or a bare loop.
 
-Services come and go with each turn, so that a contestant meets a server that has nothing else to
-do.
+Services are created and destroyed with each turn, so that the server has nothing else to do.
 """
 
 from __future__ import annotations
@@ -29,11 +28,11 @@ from benchmarks.work import Work, load_type, make_handler, make_qos, make_respon
 
 LEAN_DEPTH = 1000
 WAIT_SET_LIMIT = 16
-"""Services from which on building the wait set would be most of the server's work."""
+"""With more services, building the wait set would be most of the server's work."""
 
 
 class Lean(ABC):
-    """A bare loop in a thread: waits, takes requests and answers them when they are due."""
+    """A bare loop in a thread, which waits, takes requests and answers them when they are due."""
 
     def __init__(self, node: Any, work: Work) -> None:
         self._node = node
@@ -54,11 +53,11 @@ class Lean(ABC):
 
     @abstractmethod
     def wait(self, seconds: float | None) -> Iterable[int]:
-        """The services with requests, as soon as there are any, or none after `seconds`."""
+        """Wait for requests and return their services, or none after `seconds`."""
 
     @abstractmethod
     def wake(self) -> None:
-        """Ends a wait from another thread."""
+        """End a wait, from another thread."""
 
     def start(self) -> None:
         self._thread.start()
@@ -93,7 +92,7 @@ class Lean(ABC):
 
 
 class WaitSetServer(Lean):
-    """Sleeps in one wait set, made once."""
+    """Sleeps in one wait set, which is created once."""
 
     def __init__(self, node: Any, work: Work) -> None:
         super().__init__(node, work)
@@ -120,7 +119,7 @@ class WaitSetServer(Lean):
 
 
 class EventServer(Lean):
-    """Sleeps on an eventfd for each service, which the middleware signals: for many services."""
+    """Sleeps on one eventfd for each service, which the middleware signals; for many services."""
 
     def __init__(self, node: Any, work: Work) -> None:
         super().__init__(node, work)
@@ -156,16 +155,16 @@ class EventServer(Lean):
 
 
 def signal_requests(service: Any, fd: int | None) -> None:
-    """Has the middleware count a service's new requests on an eventfd; None ends that."""
+    """Let the middleware count a service's new requests on an eventfd; None stops it."""
     on_request = ctypes.CDLL("librcl.so").rcl_service_set_on_new_request_callback
     on_request.argtypes = [ctypes.c_void_p] * 3
     callback = ctypes.cast(ctypes.CDLL(None).eventfd_write, ctypes.c_void_p)
     if on_request(service.pointer, None if fd is None else callback, fd):
-        raise RuntimeError("the middleware takes no request callback")
+        raise RuntimeError("the middleware does not accept a request callback")
 
 
 class Server:
-    """What the runner may ask for: ``serve``, ``usage``, ``end``."""
+    """Answers the runner's requests: ``serve``, ``usage`` and ``end``."""
 
     def __init__(self) -> None:
         self._stack = ExitStack()

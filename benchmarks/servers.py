@@ -1,4 +1,4 @@
-"""The servers beside stock rclpy's plain one: its async handler, and rosasync's of each kind."""
+"""More servers: stock rclpy with an async handler, and rosasync with each kind of handler."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["SERVERS", "async_handler", "rosasync_server"]
 
 
 def async_handler(work: Work) -> Callable[[Any, Any], Any]:
-    """The handler of `make_handler` as a coroutine function."""
+    """Return the handler of `make_handler` as a coroutine function."""
     plain = make_handler(work)
 
     async def handler(request: Any, response: Any) -> Any:
@@ -28,7 +28,7 @@ def async_handler(work: Work) -> Callable[[Any, Any], Any]:
 
 @contextmanager
 def rosasync_server(work: Work) -> Iterator[None]:
-    """Serves `work` in a loop of its own, in a thread."""
+    """Serve `work` in a loop in another thread."""
     started: threading.Event = threading.Event()
     ending: list[Callable[[], object]] = []
     thread = threading.Thread(target=_run, args=(work, started, ending))
@@ -70,4 +70,4 @@ SERVERS = {
     "rosasync-plain": "direct, plain",
     "rosasync-executor": "executor, async",
 }
-"""What the name of a server means: bridge, handler, loop."""
+"""The bridge, handler and loop of each server."""

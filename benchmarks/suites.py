@@ -1,4 +1,4 @@
-"""The scenarios behind each command."""
+"""The scenarios of each command."""
 
 from __future__ import annotations
 
@@ -174,7 +174,7 @@ def _resting(clients: int) -> Work:
 
 
 def _targets() -> list[Scenario]:
-    """The least that has to be measured to see whether the targets are reached."""
+    """Return the fewest scenarios that show whether the targets are met."""
     needed: defaultdict[str, set[str]] = defaultdict(set)
     for scenario, contestant in (side for target in TARGETS for side in target.sides):
         needed[scenario].update(PEERS.get(contestant, (contestant,)))
@@ -205,7 +205,7 @@ SUITES: dict[str, Callable[[], list[Scenario]]] = {
 def make_suite(
     name: str, *, quick: bool = False, contestants: Collection[str] = ()
 ) -> list[Scenario]:
-    """The scenarios of one command, shortened and narrowed down as asked.
+    """Return the scenarios of one command, shortened and narrowed as requested.
 
     Raises:
         ValueError: a contestant that does not exist.

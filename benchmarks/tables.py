@@ -1,4 +1,4 @@
-"""Results as tables, in the terminal and in Markdown."""
+"""Shows results as tables, in the terminal and in Markdown."""
 
 from __future__ import annotations
 
@@ -30,16 +30,14 @@ BASELINES = {"call": "÷ call", "floor": "÷ floor"}
 
 
 def describe(scenario: dict[str, Any]) -> str:
-    """What a scenario is, in one line."""
+    """Describe a scenario in one line."""
     work = scenario["work"]
     if scenario["action"] == "tick":
         return describe_ticks(scenario["measure"], scenario["callers"])
     if scenario["action"] == "rest":
-        return (
-            f"{work['idle_clients'] or 'one'} client(s), nothing called, {scenario['seconds']:g} s"
-        )
+        return f"{work['idle_clients'] or 'one'} client(s), no calls, {scenario['seconds']:g} s"
     if scenario["action"] == "soak":
-        return "a third of the calls each answered, timed out and cancelled"
+        return "of the calls, a third is answered, a third times out, and a third is cancelled"
     place = ", on another host" if scenario["host"] == "other" else ""
     server = {
         "inside": "in the same process",
@@ -50,7 +48,7 @@ def describe(scenario: dict[str, Any]) -> str:
     }
     parts = [f"server: {server[work['server']]}{place}", f"callers: {scenario['callers']}"]
     if scenario["flood"]:
-        parts.append(f"another process keeps {scenario['flood']} requests out")
+        parts.append(f"another process keeps {scenario['flood']} requests outstanding")
     parts += [f"the caller is busy for {work['busy'] * 1e3:g} ms at a time"] * (work["busy"] > 0)
     parts += [f"services: {work['services']}"] * (work["services"] > 1)
     parts += [f"idle clients: {work['idle_clients']}"] * (work["idle_clients"] > 0)
@@ -61,7 +59,7 @@ def describe(scenario: dict[str, Any]) -> str:
 
 
 def rows(results: Results, scenario: str) -> tuple[list[str], list[list[str]]]:
-    """A heading and the rows of one scenario, a row for each contestant."""
+    """Return the heading and the rows of one scenario, with a row for each contestant."""
     metric = results.scenarios[scenario]["metric"]
     contestants = results.contestants(scenario)
     baselines = {key: label for key, label in BASELINES.items() if key in contestants}
@@ -93,7 +91,7 @@ def scenario_table(results: Results, scenario: str) -> Table:
 
 
 def target_table(results: Results) -> Table | None:
-    """How the targets came out, or None where none was measured."""
+    """Return the table of the targets, or None if none was measured."""
     verdicts = list(judge(results))
     if not verdicts:
         return None

@@ -1,4 +1,4 @@
-"""What the library sets out to reach, as ratios in one run, and whether it did."""
+"""The targets of the library, as ratios within one run, and whether they are met."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ PEERS = {
         key for key, entry in CONTESTANTS.items() if entry.kind == "peer" and not entry.spins
     ),
 }
-"""Stand for whichever of these does best."""
+"""Each name stands for the contestant with the best result."""
 LATENCIES = ("median", "p99", "p99.9")
-"""The metrics of which a peer does best that has the least."""
+"""The metrics of which the lowest value is the best."""
 
 
 @dataclass(frozen=True)
 class Target:
-    """A figure, or its ratio to another's where there is one, and its bound.
+    """A figure or a ratio of two figures, and its bound.
 
     Attributes:
-        of: whose figure.
-        to: what it is divided by.
-        beside: whose figure is given with it, for comparison.
+        of: the side with the figure.
+        to: the side whose figure is the divisor.
+        beside: a side whose figure is shown for comparison.
     """
 
     name: str
@@ -47,13 +47,13 @@ class Target:
 
     @property
     def sides(self) -> list[Side]:
-        """Everything that has to be measured for it."""
+        """Every side that has to be measured."""
         return [side for side in (self.of, self.to, self.beside) if side]
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """How a target came out; `met` is None where it was not measured."""
+    """The outcome of a target; `met` is None if it was not measured."""
 
     target: Target
     met: bool | None
@@ -213,7 +213,7 @@ TARGETS = (
 
 
 def judge(results: Results) -> Iterator[Verdict]:
-    """A verdict for each target of which the results have all the scenarios."""
+    """Return a verdict for each target whose scenarios are all in the results."""
     for target in TARGETS:
         if all(results.contestants(scenario) for scenario, _ in target.sides):
             yield _judge(target, results)
@@ -230,7 +230,7 @@ def _judge(target: Target, results: Results) -> Verdict:
         to = sides[target.to]
         found = ratio(results.of(*of), results.of(*to), target.metric)
         if found is None:
-            return Verdict(target, None, "not measured: no round that both ended")
+            return Verdict(target, None, "not measured: no round that both completed")
         value, spread = found.median, f", {found.low:.2f} to {found.high:.2f} in {found.rounds}"
         spread += f"; {to[1]}" if to != target.to else ""
     else:
@@ -245,7 +245,7 @@ def _judge(target: Target, results: Results) -> Verdict:
 
 
 def _best(results: Results, side: Side, metric: str, better: Callable[..., str]) -> Side:
-    """The contestant that is meant: where any of several, the one that did best."""
+    """Resolve a side: a name in `PEERS` is its contestant with the best result."""
     scenario, contestant = side
     figures = {
         key: value

@@ -1,4 +1,4 @@
-"""Trees whose leaves call services, and what is timed about their ticks."""
+"""Trees whose leaves call services, and the measures of their ticks."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ __all__ = [
 now = time.perf_counter_ns
 
 Ticks: TypeAlias = Iterator[float]
-"""Yields where a tick is over: the seconds until the next one."""
+"""Yields after each tick the seconds until the next one."""
 
 PERIOD = 0.001
 """Seconds between two ticks."""
@@ -39,40 +39,40 @@ PENDING_TIMEOUT = 120.0
 """Seconds for which a call to a server that does not answer stays pending."""
 
 BATCH = 100
-"""Looks at a state for one sample: one alone takes less time than the clock."""
+"""Reads of a state for one sample: a single read takes less time than reading the clock."""
 
 
 class Leaf(Protocol):
     """One leaf of a tree, with one call at a time."""
 
     def start(self) -> None:
-        """Starts a call."""
+        """Start a call."""
 
     def look(self) -> bool:
-        """Whether the call has ended; raises what it ended in, unless that is an answer."""
+        """Return whether the call was answered; raise its error if it failed."""
 
     def state(self) -> object:
-        """The state alone, as `look` looks at it."""
+        """Return the state that `look` reads."""
 
 
 class Ticking(Protocol):
     """A contestant whose calls are made by the leaves of a tree."""
 
     def tick(self, measure: str, leaves: int, calls: int, seconds: float) -> TickTally:
-        """Measures one of the things `Ticked` knows."""
+        """Take one of the measures of `Ticked`."""
 
 
 def call_timeout(work: Work) -> float:
-    """Seconds for a call: those of a slow server are to stay pending."""
+    """Return the timeout of a call; calls to a slow server must stay pending."""
     return PENDING_TIMEOUT if any(work.delays) else CALL_TIMEOUT
 
 
 @dataclass
 class TickTally(Tally):
-    """What came of a run of ticks.
+    """The result of a run of ticks.
 
     Attributes:
-        added: threads and descriptors in use beyond those before the leaves were made.
+        added: threads and descriptors in use, minus those before the leaves were created.
     """
 
     added: dict[str, int] = field(default_factory=dict)
@@ -80,14 +80,14 @@ class TickTally(Tally):
 
 @dataclass
 class Stamps:
-    """When the last request was handed to the middleware, and the last response taken from it."""
+    """When the last request was passed to the middleware, and the last response taken from it."""
 
     sent: int = 0
     taken: int = 0
 
 
 def watch_rclpy() -> Stamps:
-    """Has every client of this process stamp what it sends and takes, whoever calls it."""
+    """Let every client of this process record when it sends and takes."""
     stamps = Stamps()
     send, take = _rclpy.Client.send_request, _rclpy.Client.take_response
 
@@ -108,35 +108,37 @@ def watch_rclpy() -> Stamps:
 
 
 class Ticked(ABC):
-    """The measures, each written as a generator that yields where a tick is over.
+    """The measures, each a generator that yields after each tick.
 
-    ``tick``: how long a tick takes in which every leaf looks at a pending call. ``state``: one
-    look at the state of a pending call. ``decide``: from the leaf's decision to the request in the
-    middleware's hands. ``see``: from the response out of the middleware's hands to the tick that
-    sees it, with ticks back to back. ``rate``: calls by as many leaves as there are, each starting
-    the next call in the tick that sees the answer. ``added``: threads and descriptors in use with
-    a call pending in every leaf.
+    - ``tick``: the duration of a tick in which every leaf checks a pending call.
+    - ``state``: the duration of one read of a pending call's state.
+    - ``decide``: from a leaf's decision until the middleware has the request.
+    - ``see``: from taking the response out of the middleware until a tick sees it, without pauses
+      between the ticks.
+    - ``rate``: calls of all leaves, each of which starts its next call in the tick that sees the
+      response.
+    - ``added``: threads and descriptors in use with a pending call in every leaf.
     """
 
     stamps: Stamps
 
     @abstractmethod
     def setup(self, work: Work) -> None:
-        """Makes ready for `work`, and returns when its server was found."""
+        """Prepare for `work`, and return when its server was found."""
 
     @abstractmethod
     def leaf(self) -> Leaf:
-        """Makes a leaf."""
+        """Create a leaf."""
 
     @abstractmethod
     def close(self) -> None:
-        """Takes down what `setup` and the leaves made."""
+        """Destroy everything that `setup` and the leaves created."""
 
     def tick(self, measure: str, leaves: int, calls: int, seconds: float) -> TickTally:
         return self._run(measure, leaves, calls, seconds, TickTally())
 
     def pending(self, leaves: Sequence[Leaf]) -> Callable[[], object]:
-        """What ticks these leaves once, each of which has a call pending."""
+        """Return a function that ticks these leaves once; each has a pending call."""
 
         def tick() -> None:
             for leaf in leaves:
@@ -145,7 +147,7 @@ class Ticked(ABC):
         return tick
 
     def drive(self, ticks: Ticks) -> None:
-        """Takes one tick after the other, sleeping in between; here in this thread."""
+        """Run the ticks on this thread, and sleep in between."""
         for seconds in ticks:
             time.sleep(seconds)
 
@@ -243,7 +245,7 @@ class Ticked(ABC):
         for _ in range(100):
             yield PERIOD
         if any(leaf.look() for leaf in tree):
-            raise RuntimeError("a call was answered that was to stay pending")
+            raise RuntimeError("a call that should stay pending was answered")
         return tree
 
     def _ended(self, leaf: Leaf, period: float, tally: TickTally) -> Generator[float, None, bool]:
@@ -253,13 +255,13 @@ class Ticked(ABC):
 
 
 async def drive_in_loop(ticks: Ticks) -> None:
-    """Takes one tick after the other, and gives the loop its turn in between."""
+    """Run the ticks, and let the loop run in between."""
     for seconds in ticks:
         await asyncio.sleep(seconds)
 
 
 def _look(leaf: Leaf, tally: TickTally) -> bool | None:
-    """Whether the call was answered; None while it is pending."""
+    """Return whether the call was answered; None while it is pending."""
     try:
         return leaf.look() or None
     except Exception as exc:
@@ -272,5 +274,5 @@ def _until(seconds: float) -> int:
 
 
 def _used() -> tuple[int, ...]:
-    """Threads and descriptors of this process."""
+    """Return the numbers of threads and descriptors of this process."""
     return len(os.listdir("/proc/self/task")), len(os.listdir("/proc/self/fd"))

@@ -15,18 +15,17 @@ CALLING = ("tick-loop", "tick-thread", "tick-threads", "tick-processes")
 AT_ONCE = ("tick-loop", "tick-thread", "tick-threads")
 
 TITLES = {
-    "tick": "one tick of a tree in which every leaf has a call pending",
-    "state": "one look at the state of a pending call",
-    "decide": "from a leaf's decision to the request in the middleware's hands",
-    "see": "from the response out of the middleware's hands to the tick that sees it, ticks back "
-    "to back",
-    "rate": "every leaf starts the next call in the tick that sees the answer",
-    "added": "threads and descriptors in use with a call pending in every leaf, above those before",
+    "tick": "one tick of a tree in which every leaf has a pending call",
+    "state": "one read of the state of a pending call",
+    "decide": "from a leaf's decision until the middleware has the request",
+    "see": "from taking the response out of the middleware until a tick sees it, without pauses",
+    "rate": "every leaf starts its next call in the tick that sees the response",
+    "added": "threads and descriptors added by a pending call in every leaf",
 }
 
 
 def make_ticks() -> list[Scenario]:
-    """A process for each call is tried with one leaf only, and once with 50 at once."""
+    """Return the scenarios. A process for each call runs with one leaf, and once with 50."""
     return [
         _ticks("tick", 1, LEAVES),
         _ticks("tick", 100, LEAVES[:-1]),
@@ -41,7 +40,7 @@ def make_ticks() -> list[Scenario]:
 
 
 def describe_ticks(measure: str, leaves: int) -> str:
-    """What such a scenario is, in one line."""
+    """Describe such a scenario in one line."""
     return f"{TITLES[measure]}, leaves: {leaves}"
 
 

@@ -1,4 +1,4 @@
-"""What a contestant is asked to do, and the requests, responses and handlers that go with it."""
+"""The work of a contestant, with its requests, responses and handlers."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ __all__ = [
 ]
 
 CALL_TIMEOUT = 2.0
-"""Seconds after which a call counts as lost, where the contestant has deadlines at all."""
+"""Seconds after which a call counts as lost, if the contestant supports deadlines."""
 
 READY_TIMEOUT = 30.0
-"""Seconds a contestant may take to find its servers."""
+"""Seconds that a contestant may take to find its servers."""
 
 
 @dataclass(frozen=True)
@@ -34,15 +34,15 @@ class Work:
     Attributes:
         srv_type: the service type by name.
         payload: bytes in the request (SetCameraInfo) or in the response (GetMap).
-        delays: seconds a server takes to answer; service ``i`` has the ``i``-th, cyclically.
-        services: how many services the calls go to, in turn.
-        idle_clients: clients that are there and never used.
-        depth: history depth of clients and servers; None for what each has by default.
+        delays: seconds until a server answers; service ``i`` has the ``i``-th, cyclically.
+        services: number of services, which the calls use in turn.
+        idle_clients: number of clients that are never used.
+        depth: history depth of clients and servers; None for the default of each.
         server: ``stock``, an rclpy service on a SingleThreadedExecutor; ``lean``, a bare loop that
-            is not the bottleneck; ``inside``, in the contestant's own process, made by itself;
-            ``stock-async``, stock with an async handler; and those of `benchmarks.servers`.
-        busy: seconds at a time for which the contestant's thread looks at no responses.
-        srv_name: what all services of this work begin with; the runner gives each turn its own.
+            is not the bottleneck; ``inside``, created by the contestant in its own process;
+            ``stock-async``, stock with an async handler; or one of `benchmarks.servers`.
+        busy: seconds at a time for which the contestant's thread handles no responses.
+        srv_name: the prefix of all service names; each turn has its own.
     """
 
     srv_type: str = "std_srvs/srv/Empty"
@@ -94,13 +94,13 @@ def make_response(work: Work) -> Any:
 
 
 def make_handler(work: Work) -> Callable[[Any, Any], Any]:
-    """A service callback, for the servers a contestant makes in its own process."""
+    """Return a service callback that answers with a prepared response."""
     prepared = make_response(work)
     return lambda _request, _response: prepared
 
 
 def make_qos(depth: int | None) -> Any:
-    """The stock service QoS, with another depth where one is asked for."""
+    """Return the stock service QoS, with another depth if one is given."""
     from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_services_default
 
     if depth is None:

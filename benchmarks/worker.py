@@ -1,4 +1,4 @@
-"""The process of one contestant, asked by the runner: ``python -m benchmarks.worker KEY``."""
+"""The process of one contestant, controlled by the runner: ``python -m benchmarks.worker KEY``."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from benchmarks.ticking import Ticking
 from benchmarks.work import Work
 
 MARGIN = 0.5
-"""Seconds for which a rest is not yet, and no longer, looked at."""
+"""Seconds at the start and at the end of a rest that are not measured."""
 SOAK_STATES = (10_000, 100_000)
-"""The calls after which the memory is looked at."""
+"""The numbers of calls after which memory is measured."""
 
 
 class Worker:
@@ -41,7 +41,7 @@ class Worker:
         return _result(tally, usage() - before)
 
     def do_rest(self, seconds: float) -> dict[str, Any]:
-        """The beginning and the end of the rest are left out, which are not rest."""
+        """Rest, and measure without the first and the last moments."""
         with ThreadPoolExecutor(1) as thread:
             used = thread.submit(_usage_within, seconds)
             self._contestant.rest(seconds + 2 * MARGIN)

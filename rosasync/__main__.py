@@ -1,4 +1,4 @@
-"""The entry of the ``rosasync`` command and of ``python -m rosasync``."""
+"""The entry point of the ``rosasync`` command and of ``python -m rosasync``."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ __all__ = ["main"]
 
 
 def main() -> None:
-    """Run the command line, or say which extra it needs and exit with 2."""
+    """Run the command line, or print which extra is missing and exit with 2."""
     try:
         from rosasync.cli.app import app
     except ModuleNotFoundError as error:

@@ -1,4 +1,4 @@
-"""The contestants: one file each, written as their own users are told to write it."""
+"""The contestants, one file each, written as their own documentation recommends."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ __all__ = ["CONTESTANTS", "Contestant", "Entry", "Tally", "make_contestant"]
 
 @dataclass(frozen=True)
 class Entry:
-    """A contestant by its place: the module's ``CONTESTANTS[key]`` makes one."""
+    """Where to find a contestant: ``CONTESTANTS[key]`` of the module creates one."""
 
     label: str
     module: str
     kind: Literal["ours", "peer", "limit", "leaf"] = "peer"
-    """A limit is what a call costs at least, no way to write a program; a leaf calls in ticks."""
+    """A ``limit`` is the lower bound of a call's cost, not a practical program. A ``leaf`` calls in
+    ticks."""
     spins: bool = False
-    """Whether it burns a core while it waits."""
+    """Whether it keeps a core busy while it waits."""
 
 
 CONTESTANTS = {
@@ -61,7 +62,7 @@ CONTESTANTS = {
 
 
 def make_contestant(key: str) -> Contestant:
-    """Makes a contestant, not yet set up."""
+    """Create a contestant, without setting it up."""
     module = importlib.import_module(f"{__name__}.{CONTESTANTS[key].module}")
     contestant: Contestant = module.CONTESTANTS[key]()
     return contestant

@@ -1,4 +1,4 @@
-"""asyncio-for-robotics, as its service client example has it."""
+"""asyncio-for-robotics, as in its service client example."""
 
 from __future__ import annotations
 

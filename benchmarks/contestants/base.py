@@ -1,4 +1,4 @@
-"""What every contestant answers to, and the loops that time its calls."""
+"""The interface of every contestant, and the loops that time its calls."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ __all__ = [
 now = time.perf_counter_ns
 
 BREATH = 0.005
-"""Seconds a contestant that is busy has for its calls in between."""
+"""Seconds for calls between two busy periods."""
 
 
 @dataclass
 class Tally:
-    """What came of a run of calls: times in ns, and how many calls got no answer."""
+    """The result of a run of calls: times in ns, and the numbers of unanswered calls."""
 
     samples: list[int] = field(default_factory=list)
     elapsed: int = 0
@@ -46,7 +46,7 @@ class Tally:
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     def miss(self, exc: BaseException) -> None:
-        """Counts a call that ended in `exc`: lost where that is a timeout, else failed."""
+        """Count a call that ended with `exc`: as lost if it is a timeout, otherwise as failed."""
         with self._lock:
             if isinstance(exc, TimeoutError):
                 self.lost += 1
@@ -62,33 +62,33 @@ class Tally:
 
 
 class Contestant(Protocol):
-    """One way to call services, in a process of its own.
+    """One way to call services, in its own process.
 
-    A run ends after `calls` calls, or when `seconds` are over: calls that are out then are still
-    waited for, no new ones are made.
+    A run ends after `calls` calls, or after `seconds`. Then no new calls are made, but outstanding
+    ones are awaited.
     """
 
     def setup(self, work: Work) -> None:
-        """Makes the clients for `work`, and returns when their servers were found."""
+        """Create the clients for `work`, and return when their servers were found."""
 
     def one_at_a_time(self, calls: int, seconds: float) -> Tally:
-        """Makes the next call when the last one is answered."""
+        """Make each call after the previous one is answered."""
 
     def at_once(self, callers: int, calls: int, seconds: float) -> Tally:
-        """Keeps as many calls out as there are callers."""
+        """Keep as many calls outstanding as there are callers."""
 
     def rest(self, seconds: float) -> None:
-        """Stays ready, and calls nothing."""
+        """Stay ready without calling."""
 
     def close(self) -> None:
-        """Takes down what `setup` made."""
+        """Destroy what `setup` created."""
 
 
 class Soaking(Contestant, Protocol):
-    """A contestant that can be watched for leaks."""
+    """A contestant that can be checked for leaks."""
 
     def soak(self, calls: int) -> Tally:
-        """Makes calls of which a third each is answered, times out and is cancelled."""
+        """Make calls: a third is answered, a third times out, and a third is cancelled."""
 
 
 class Blocking(ABC):
@@ -98,7 +98,7 @@ class Blocking(ABC):
 
     @abstractmethod
     def call(self, service: int) -> None:
-        """Makes one call; raises TimeoutError where no answer came."""
+        """Make one call; raise TimeoutError if there is no answer."""
 
     def one_at_a_time(self, calls: int, seconds: float) -> Tally:
         tally = Tally()
@@ -137,13 +137,13 @@ class Blocking(ABC):
 
 
 class Windowed(ABC):
-    """A contestant that starts calls and is told when they are over."""
+    """A contestant that starts calls and is notified when they end."""
 
     services = 1
 
     @abstractmethod
     def start(self, service: int, over: Callable[[Exception | None], None]) -> None:
-        """Starts one call, and calls `over` from any thread when it has ended."""
+        """Start one call, and call `over` from any thread when it has ended."""
 
     def one_at_a_time(self, calls: int, seconds: float) -> Tally:
         return self.at_once(1, calls, seconds)
@@ -184,7 +184,7 @@ class Asynchronous(ABC):
 
     @abstractmethod
     async def call(self, service: int) -> None:
-        """Makes one call; raises TimeoutError where no answer came."""
+        """Make one call; raise TimeoutError if there is no answer."""
 
     @abstractmethod
     async def shut(self) -> None: ...
@@ -219,7 +219,7 @@ class Asynchronous(ABC):
         return tally
 
     async def _other_work(self) -> None:
-        """Holds the loop up, where it is to be busy with something else."""
+        """Block the loop, if the work says that it is busy."""
         while self.busy:
             time.sleep(self.busy)  # noqa: ASYNC251
             await asyncio.sleep(BREATH)
@@ -238,15 +238,15 @@ class Asynchronous(ABC):
 
 
 def answered(response: object) -> None:
-    """Turns the None by which ``client.call`` reports a timeout in Jazzy into a TimeoutError."""
+    """Raise TimeoutError if the response is None, as after a timeout of Jazzy's ``client.call``."""
     if response is None:
         raise TimeoutError("no response")
 
 
 def make_clients(node: Any, work: Work, callback_group: Any = None) -> list[Any]:
-    """The stock clients for `work` on `node`, their servers found, and the idle ones beside them.
+    """Create the stock clients and idle clients for `work`, and wait for their servers.
 
-    Where the server belongs inside, it is made on the same node.
+    If the server is ``inside``, it is created on the same node.
     """
     srv_type, qos = load_type(work.srv_type), make_qos(work.depth)
     options = {"qos_profile": qos, "callback_group": callback_group}
@@ -264,7 +264,7 @@ def make_clients(node: Any, work: Work, callback_group: Any = None) -> list[Any]
 
 @contextmanager
 def spinning(node: Any, executor: Any) -> Iterator[None]:
-    """Spins `node` in a thread; ends with rclpy shut down, node and thread gone."""
+    """Spin `node` in a thread; at the end, shut rclpy down and end node and thread."""
     import rclpy
 
     thread = threading.Thread(target=_spin, args=(executor,), daemon=True)

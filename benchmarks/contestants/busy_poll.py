@@ -1,4 +1,4 @@
-"""``take_response`` in a tight loop: the limit, and it burns a core."""
+"""``take_response`` in a tight loop, which keeps a core busy: the limit."""
 
 from __future__ import annotations
 

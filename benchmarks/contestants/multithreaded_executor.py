@@ -1,4 +1,4 @@
-"""``client.call`` from the callers' threads, the node spun by a MultiThreadedExecutor."""
+"""``client.call`` from the callers' threads, with a MultiThreadedExecutor."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``call_async``, its future polled in the loop with ``sleep(0)``; an executor in a thread."""
+"""``call_async``, whose future is polled in the loop with ``sleep(0)``; executor in a thread."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class PolledFuture(Asynchronous):
 
     async def call(self, service: int) -> None:
         future = self._clients[service].call_async(self._request)
-        while not future.done():  # noqa: ASYNC110 - this is what is measured
+        while not future.done():  # noqa: ASYNC110 - the measured pattern
             await asyncio.sleep(0)
         future.result()
 

@@ -1,4 +1,4 @@
-"""A process for each call, its state shared through a SyncManager: the seeds' first design."""
+"""A process for each call, with its state in a SyncManager: the notes' first design."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from benchmarks.work import READY_TIMEOUT, Work, load_type, make_qos, make_reque
 
 class ProcessPerCall(Windowed):
     def setup(self, work: Work) -> None:
-        """Imports what the processes need, so that a forked one has it; ROS starts in each."""
+        """Import the modules before the processes are forked; each process initialises ROS."""
         load_type(work.srv_type)
         self._work = work
         self.services = work.services

@@ -1,4 +1,4 @@
-"""rosasync: a session, and a bound client of it."""
+"""rosasync: a session and its bound clients."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class Rosasync(Asynchronous):
         await self._stack.aclose()
 
     def soak(self, calls: int) -> Tally:
-        """A third of the callers is answered, a third times out, a third is cancelled."""
+        """Make calls: a third is answered, a third times out, and a third is cancelled."""
         return self.runner.run(self._soak(calls))
 
     async def _soak(self, calls: int) -> Tally:
@@ -87,14 +87,14 @@ class Rosasync(Asynchronous):
             await self._clients[0].call(self._request)
 
     async def _expire(self, calls: range) -> None:
-        """Every call of `calls` times out; one that is answered all the same is made again."""
+        """Let every call time out; repeat a call that is answered first."""
         for _ in calls:
             with suppress(rosasync.CallError):
                 while True:
                     await self._clients[1].call(self._request, timeout=SOAKING_TIMEOUT)
 
     async def _cancel(self, calls: range) -> None:
-        """Every call of `calls` is cancelled; one that is answered before is made again."""
+        """Cancel every call; repeat a call that is answered first."""
         for _ in calls:
             cancelled = False
             while not cancelled:

@@ -1,4 +1,4 @@
-"""``spin_once(timeout_sec=0)`` in an asyncio task: no threads, and a core at 100 %."""
+"""``spin_once(timeout_sec=0)`` in an asyncio task: no threads, but a core at 100 %."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``rclpy.spin_until_future_complete``, as the ROS 2 tutorials call a service."""
+"""``rclpy.spin_until_future_complete``, as in the ROS 2 tutorials."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class SpinUntilComplete(Blocking):
         self._complete(self._clients[service].call_async(self._request), CALL_TIMEOUT)
 
     def at_once(self, callers: int, calls: int, seconds: float) -> Tally:
-        """One thread may spin the node: so the calls go out in batches, one for each caller."""
+        """Send the calls in batches of one for each caller, because only one thread may spin."""
         tally = Tally()
         until = now() + round(seconds * 1e9)
         with tally.timed():

@@ -1,4 +1,4 @@
-"""A thread for each call, which claims a client from a shared store: the seeds' second design."""
+"""A thread for each call, which claims a client from a store: the notes' second design."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from benchmarks.work import CALL_TIMEOUT, READY_TIMEOUT, Work, load_type, make_q
 
 
 class ProxyStore:
-    """Clients by url and type, claimed for one call and unclaimed after it; made on demand."""
+    """Clients by url and type, created on demand, claimed for one call and released after it."""
 
     def __init__(self, node: Any, depth: int | None) -> None:
         self._node = node

@@ -1,4 +1,4 @@
-"""``client.call`` handed to a thread pool, whose futures say when it is over."""
+"""``client.call`` in a thread pool."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``client.call`` from the callers' threads, the node spun by an executor in another."""
+"""``client.call`` from the callers' threads, with an executor in another thread."""
 
 from __future__ import annotations
 

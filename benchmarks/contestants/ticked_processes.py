@@ -1,4 +1,4 @@
-"""Leaves with a process for each call, its state in a SyncManager: the seeds' first design."""
+"""Leaves with a process for each call, its state in a SyncManager: the notes' first design."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class ProcessLeaf:
 
 class ProcessPerCall(Ticked):
     def setup(self, work: Work) -> None:
-        """Imports what the processes need, so that a forked one has it; ROS starts in each."""
+        """Import the modules before the processes are forked; each process initialises ROS."""
         self.stamps = watch_rclpy()
         load_type(work.srv_type)
         self._work = work

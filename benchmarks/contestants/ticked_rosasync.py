@@ -1,4 +1,4 @@
-"""Leaves of rosasync: `AsyncServiceProxy` ticked in the loop or in a thread, and py_trees."""
+"""rosasync's leaves: `AsyncServiceProxy`, ticked in the loop or in a thread, and py_trees."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class ProxyLeaf:
 
 
 class InLoop(Ticked):
-    """Ticked in the loop, which has its turn between ticks."""
+    """Ticked in the loop, which runs between the ticks."""
 
     def setup(self, work: Work) -> None:
         self.stamps = watch_rclpy()
@@ -66,7 +66,7 @@ class InLoop(Ticked):
 
 
 class InThread(Ticked):
-    """Ticked in a thread of its own, beside that of the loop."""
+    """Ticked in another thread than the loop's."""
 
     def setup(self, work: Work) -> None:
         self.stamps = watch_rclpy()
@@ -126,14 +126,14 @@ class PyTrees(InThread):
             tick = behaviours[0].tick_once
             return tick
         root = py_trees.composites.Parallel("root", ParallelPolicy.SuccessOnAll(), behaviours)
-        # Its own status decides whether it stops its children first.
+        # A root that is not RUNNING would stop its children first.
         root.status = Status.RUNNING
         tick = root.tick_once
         return tick
 
 
 class Running(PyTrees):
-    """py_trees' own `Running`, which calls nothing: what a tick costs at least."""
+    """py_trees' own `Running`, without a call: the lower bound of a tick's cost."""
 
     def leaf(self) -> Leaf:
         return BehaviourLeaf(py_trees.behaviours.Running("leaf"))

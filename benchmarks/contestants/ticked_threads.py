@@ -1,4 +1,4 @@
-"""Leaves with a thread for each call, which claims a client: the seeds' second design."""
+"""Leaves with a thread for each call, which claims a client: the notes' second design."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class ThreadLeaf:
     def start(self) -> None:
         with self._lock:
             self._data["state"] = "running"
-        # A daemon: the worker may end with calls pending.
+        # A daemon, because the worker may end with pending calls.
         threading.Thread(target=self._run, daemon=True).start()
 
     def state(self) -> str:

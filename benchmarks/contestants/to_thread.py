@@ -1,4 +1,4 @@
-"""``asyncio.to_thread(client.call)``: the blocking call kept off the loop."""
+"""``asyncio.to_thread(client.call)``: the blocking call runs in another thread."""
 
 from __future__ import annotations
 

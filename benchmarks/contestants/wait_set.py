@@ -1,4 +1,4 @@
-"""A wait set in the calling thread, and nothing else: the floor for anything that sleeps."""
+"""A bare wait set in the calling thread: the floor for every contestant that sleeps."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class WaitSet:
         return self.at_once(1, calls, seconds)
 
     def at_once(self, callers: int, calls: int, seconds: float) -> Tally:
-        """One thread keeps all the calls out, and sends the next for each that is answered."""
+        """Keep all calls outstanding from one thread, and send another for each answer."""
         tally = Tally()
         clients = self._clients
         until = now() + round(seconds * 1e9)
@@ -45,7 +45,7 @@ class WaitSet:
                 self.look(out, tally)
 
     def look(self, out: dict[tuple[int, int], int], tally: Tally) -> None:
-        """Waits, and takes what has come."""
+        """Wait, and take the responses."""
         self._wait_set.clear_entities()
         for client in self._clients:
             self._wait_set.add_client(client)
@@ -75,7 +75,7 @@ class WaitSet:
 
 
 def give_up(out: dict[tuple[int, int], int], tally: Tally, patience: float) -> None:
-    """Counts every call as lost that has been out for too long; the first is the oldest."""
+    """Count every call that is outstanding for too long as lost; the first is the oldest."""
     limit = now() - round(patience * 1e9)
     while out and out[oldest := next(iter(out))] < limit:
         del out[oldest]

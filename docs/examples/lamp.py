@@ -1,4 +1,4 @@
-"""A lamp, as a plain rclpy service server: ``/lamp/switch`` of type ``std_srvs/srv/SetBool``."""
+"""A lamp in plain rclpy: the service ``/lamp/switch``, of type ``std_srvs/srv/SetBool``."""
 
 import rclpy
 from rclpy.executors import ExternalShutdownException

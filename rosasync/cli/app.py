@@ -1,4 +1,4 @@
-"""The command line, ``rosasync``; started by ``rosasync.__main__``."""
+"""The commands of ``rosasync``; `rosasync.__main__` starts them."""
 
 from __future__ import annotations
 
@@ -45,14 +45,15 @@ def _main(
 @app.command()
 def demo(
     calls: Annotated[
-        int, typer.Option(min=1, help="Calls of each contestant, and as many ten at once.")
+        int,
+        typer.Option(min=1, help="Calls of each contestant one at a time, and again ten at once."),
     ] = 2000,
-    seconds: Annotated[float, typer.Option(min=0.1, help="Most seconds to measure.")] = 8.0,
+    seconds: Annotated[float, typer.Option(min=0.1, help="Seconds to measure at most.")] = 8.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
-    """Call a stock rclpy server with rosasync and with client.call, and show both.
+    """Call a stock rclpy server with rosasync and with client.call, and compare them.
 
-    The server runs in a process of its own, in a ROS domain that nothing else on this machine uses.
+    The server runs in its own process, in a ROS domain that nothing else on this machine uses.
     """
     try:
         run_demo(calls=calls, seconds=seconds, as_json=as_json)

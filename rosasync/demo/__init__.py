@@ -1,1 +1,1 @@
-"""The demo: rosasync beside threaded ``client.call``, on a stock server in another process."""
+"""The demo: rosasync compared with threaded ``client.call``, against a stock server."""

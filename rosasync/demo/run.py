@@ -1,4 +1,4 @@
-"""``rosasync demo``: rosasync beside threaded ``client.call``, against a stock rclpy server."""
+"""``rosasync demo``: rosasync compared with threaded ``client.call``, on a stock rclpy server."""
 
 from __future__ import annotations
 
@@ -32,26 +32,26 @@ __all__ = ["DemoError", "Figures", "Report", "run_demo"]
 
 OURS, STOCK = "rosasync", "client.call"
 SRV_NAMES = {OURS: "/rosasync_demo/ours", STOCK: "/rosasync_demo/stock"}
-"""A name for each: clients that share one are woken by each other's responses."""
+"""One name for each contestant: clients of the same name wake each other with their responses."""
 
 AT_ONCE = (1, 10)
 ROUNDS = 10
 WARM_UP = 20
 CALL_TIMEOUT = 3.0
 GREETINGS, GREETING_TIMEOUT = 6, 0.5
-"""How often a first call is made until it is answered, and seconds for each of them."""
+"""The most attempts at a first call, and seconds for each attempt."""
 
 START_LIMIT, END_LIMIT = 8.0, 1.5
-"""Seconds for start-up, and for the server to end once asked, before it is killed."""
+"""Seconds for the start, and for the server to end before it is killed."""
 
 
 class DemoError(Exception):
-    """The demo could not be run to its end; the message says why."""
+    """The demo could not be completed; the message says why."""
 
 
 @dataclass(frozen=True)
 class Figures:
-    """What was measured of one contestant."""
+    """The measured figures of one contestant."""
 
     median_us: float
     p99_us: float
@@ -73,9 +73,9 @@ class Samples:
     """The calls of one contestant, from all rounds.
 
     Attributes:
-        latencies: seconds of each call.
-        wall: seconds that the rounds took.
-        cpu: seconds of CPU that this process used in them, all of its threads together.
+        latencies: seconds for each call.
+        wall: seconds for all rounds.
+        cpu: CPU seconds that this process used in the rounds, in all threads.
     """
 
     latencies: list[float] = field(default_factory=list)
@@ -84,14 +84,14 @@ class Samples:
 
     @contextmanager
     def measure(self) -> Iterator[None]:
-        """Add what passes inside to ``wall`` and ``cpu``."""
+        """Add the time spent in the block to ``wall`` and ``cpu``."""
         wall, cpu = time.perf_counter(), time.process_time()
         yield
         self.wall += time.perf_counter() - wall
         self.cpu += time.process_time() - cpu
 
     def figures(self) -> Figures:
-        """Return the figures; there must be samples."""
+        """Return the figures; at least one sample is required."""
         calls = len(self.latencies)
         ordered = sorted(self.latencies)
         return Figures(
@@ -104,7 +104,7 @@ class Samples:
 
 @dataclass(frozen=True)
 class Report:
-    """What the demo measured, by contestant and number of calls at once."""
+    """The results of the demo, by contestant and number of calls at once."""
 
     bridge: str
     samples: dict[tuple[str, int], Samples]
@@ -122,7 +122,7 @@ class Report:
         return json.dumps({"bridge": self.bridge, **machine, "contests": contests}, indent=2)
 
     def as_text(self) -> Group:
-        """Return the table and the histogram, for a rich console."""
+        """Return the table and the histogram for a rich console."""
         return Group(self._table(), "", self._histogram(), self._legend())
 
     def _table(self) -> Table:
@@ -160,10 +160,10 @@ class Report:
     def _legend(self) -> str:
         calls = sum(len(samples.latencies) for samples in self.samples.values())
         return (
-            f"\n{calls:,} calls, each answered with its own text."
-            f"\n{OURS}: one session, the {self.bridge} bridge."
-            f"\n{STOCK}: threads beside a SingleThreadedExecutor."
-            "\nCPU: of the calling process, all its threads."
+            f"\n{calls:,} calls, each with the right response."
+            f"\n{OURS}: one session, on the {self.bridge} bridge."
+            f"\n{STOCK}: threads, with a SingleThreadedExecutor in another thread."
+            "\nCPU: the time of the calling process, in all threads."
             f"\nratio: {OURS} / {STOCK}."
         )
 
@@ -182,14 +182,14 @@ def _percentile_99(ordered: list[float]) -> float:
 
 
 def _edges(latencies: list[float], bins: int) -> list[float]:
-    """Return the lower edges of bins that grow by a constant factor, up to the 99th percentile."""
+    """Return the lower edges of logarithmic bins, up to the 99th percentile."""
     ordered = sorted(latencies)
     low, high = ordered[0], _percentile_99(ordered)
     return [low * (high / low) ** (n / bins) for n in range(bins + 1)]
 
 
 def _shares(latencies: list[float], edges: list[float]) -> list[float]:
-    """Return the share of the latencies from each edge to the next; the last bin is open."""
+    """Return the share of latencies in each bin; the last bin has no upper edge."""
     ends = [*edges[1:], math.inf]
     return [
         sum(low <= latency < high for latency in latencies) / len(latencies)
@@ -198,18 +198,18 @@ def _shares(latencies: list[float], edges: list[float]) -> list[float]:
 
 
 def run_demo(*, calls: int = 2000, seconds: float = 8.0, as_json: bool = False) -> None:
-    """Run the demo and print what it measured to standard output; progress goes to stderr.
+    """Run the demo and print the results to standard output; progress goes to standard error.
 
-    Takes over the main thread and puts the process into a ROS domain of its own.
+    Call it on the main thread. It moves the process into an unused ROS domain.
 
     Args:
-        calls: calls of each contestant, one at a time, and as many again ten at once.
-        seconds: most seconds to measure; on a slow machine fewer calls are made.
+        calls: number of calls of each contestant one at a time, and again ten at once.
+        seconds: seconds to measure at most; if they run out, fewer calls are made.
         as_json: print a JSON object instead of a table and a histogram.
 
     Raises:
-        DemoError: the calls could not be made, or one was answered wrongly.
-        KeyboardInterrupt: after Ctrl-C; the server process has ended by then.
+        DemoError: the calls could not be made, or a response was wrong.
+        KeyboardInterrupt: after Ctrl-C, when the server process has ended.
     """
     isolate()
     try:
@@ -219,12 +219,12 @@ def run_demo(*, calls: int = 2000, seconds: float = 8.0, as_json: bool = False) 
     except rosasync.RosasyncError as error:
         raise DemoError(f"{type(error).__name__}: {error}") from error
     except TimeoutError as error:
-        raise DemoError(f"out of time ({error or 'is this machine busy?'})") from error
+        raise DemoError(f"timed out: {error or 'the machine may be busy'}") from error
     if as_json:
         print(report.as_json())
         return
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="replace")  # bars and µ on a terminal without Unicode
+        sys.stdout.reconfigure(errors="replace")  # for terminals without Unicode
     Console(highlight=False).print(report.as_text())
 
 
@@ -239,14 +239,14 @@ async def _run(calls: int, seconds: float) -> Report:
         with _stock_client() as client, ThreadPoolExecutor(max(AT_ONCE)) as threads:
             await session.wait_for_service(Echo, SRV_NAMES[OURS], timeout=START_LIMIT)
             if not await asyncio.to_thread(client.wait_for_service, START_LIMIT):
-                raise DemoError(f"{STOCK} does not see the server")
+                raise DemoError(f"{STOCK} did not find the server")
             await _greet(session, client)
             contestants = _Contestants(session, client, threads)
             return Report(session.bridge, await _measure(contestants, calls, seconds))
 
 
 async def _greet(session: rosasync.Session, client: ThreadedClient) -> None:
-    """Make the first calls: the server may not have matched the clients that see it already."""
+    """Make the first calls, with retries: the server may not have discovered the clients yet."""
     from rosasync.demo.stock import Echo, request_for
 
     greeting = request_for("hello")
@@ -256,12 +256,12 @@ async def _greet(session: rosasync.Session, client: ThreadedClient) -> None:
         with suppress(TimeoutError):
             await asyncio.to_thread(client.call, greeting, GREETING_TIMEOUT)
             return
-    raise DemoError(f"{STOCK} got no answer")
+    raise DemoError(f"{STOCK} got no response")
 
 
 @asynccontextmanager
 async def _stock_server() -> AsyncIterator[None]:
-    """Run the server in a process of its own, out of reach of the terminal's Ctrl-C."""
+    """Run the server in its own process and session, so that Ctrl-C does not reach it."""
     from rosasync.demo.stock import READY
 
     process = await asyncio.create_subprocess_exec(
@@ -307,7 +307,7 @@ class _Contestants:
 async def _measure(
     contestants: _Contestants, calls: int, seconds: float
 ) -> dict[tuple[str, int], Samples]:
-    """Let the contestants take turns, each for an equal part of the time that is left."""
+    """Alternate between the contestants; each turn gets an equal share of the remaining time."""
     samples = {(name, at_once): Samples() for at_once in AT_ONCE for name in (OURS, STOCK)}
     turns = [turn for _ in range(ROUNDS) for turn in samples]
     end = time.perf_counter() + seconds
@@ -327,7 +327,7 @@ async def _measure(
 
 
 def _progress() -> Progress:
-    # Refreshed between turns only: a bar that redraws itself would be measured along.
+    # Refresh only between turns, because redrawing would be measured too.
     console = Console(stderr=True)
     return Progress(
         TextColumn("{task.description:24}"),
@@ -343,7 +343,7 @@ def _progress() -> Progress:
 async def _take_turn(
     contestants: _Contestants, name: str, at_once: int, calls: int, until: float, into: Samples
 ) -> None:
-    """Make the calls, ``at_once`` callers sharing them, or fewer where ``until`` comes first."""
+    """Make the calls with ``at_once`` callers, or fewer calls if ``until`` comes first."""
     calls = max(calls, at_once)
     shares = [range(caller, calls, at_once) for caller in range(at_once)]
     turn = _our_turn if name == OURS else _stock_turn
@@ -404,4 +404,4 @@ async def _stock_turn(
 
 def _check(answer: str, text: str) -> None:
     if answer != text:
-        raise DemoError(f"asked for {text!r} to be echoed, got {answer!r}")
+        raise DemoError(f"expected the response {text!r}, got {answer!r}")

@@ -1,6 +1,6 @@
-"""Plain rclpy on both ends, to show rosasync beside: a server process and threaded ``client.call``.
+"""The plain rclpy peers of the demo: a server process and threaded ``client.call``.
 
-``python -m rosasync.demo.stock SRV_NAME …`` serves those names until its standard input ends.
+``python -m rosasync.demo.stock SRV_NAME …`` serves these names until its standard input ends.
 """
 
 from __future__ import annotations
@@ -20,27 +20,27 @@ from rclpy.signals import SignalHandlerOptions
 __all__ = ["READY", "ThreadedClient", "answer_of", "request_for", "serve"]
 
 READY = b"ready\n"
-"""What the server process writes to its standard output once its services are there."""
+"""The server process writes this to its standard output when its services exist."""
 
 Echo = AddDiagnostics
-"""Of the stock service types, the one that carries a text both ways, so that it can echo."""
+"""The stock service type with a text in both request and response, as needed for an echo."""
 
 
 def request_for(text: str) -> Any:
-    """Return a request that asks for ``text`` to be echoed."""
+    """Return a request to echo ``text``."""
     return Echo.Request(load_namespace=text)
 
 
 def answer_of(response: Any) -> str:
-    """Return the text that a response echoes."""
+    """Return the text in a response."""
     return str(response.message)
 
 
 def serve(*srv_names: str) -> None:
     """Serve an echo under each name with a SingleThreadedExecutor, until standard input ends.
 
-    Takes over the calling thread, and is meant to be all that its process does. The pipe ends with
-    the parent, however that ends, so no server outlives it.
+    Blocks the calling thread, and needs the process for itself. The pipe is closed when the parent
+    ends, also if it is killed, so the server never outlives its parent.
     """
     context = Context()
     rclpy.init(context=context)
@@ -65,16 +65,16 @@ def _echo(request: Any, response: Any) -> Any:
 
 
 def _shut_down_at_end_of_input(context: Context) -> None:
-    # os.read and not sys.stdin: a daemon thread inside sys.stdin holds its lock at exit.
+    # Not sys.stdin: a daemon thread that reads from it holds its lock at exit.
     while os.read(0, 1024):
         pass
     rclpy.try_shutdown(context=context)
 
 
 class ThreadedClient:
-    """``client.call`` as rclpy's users make it: a SingleThreadedExecutor spins in a thread.
+    """``client.call`` as it is commonly used: a SingleThreadedExecutor spins in a thread.
 
-    Its methods block and may be called from any thread but its own. To be closed.
+    Its methods block. Call them from any other thread, and call `close` at the end.
     """
 
     def __init__(self, srv_name: str) -> None:
@@ -88,17 +88,17 @@ class ThreadedClient:
         self._thread.start()
 
     def wait_for_service(self, timeout: float) -> bool:
-        """Wait up to ``timeout`` seconds for the server; return whether it is there."""
+        """Wait up to ``timeout`` seconds for the server, and return whether there is one."""
         return bool(self._client.wait_for_service(timeout_sec=timeout))
 
     def call(self, request: Any, timeout: float) -> Any:
-        """Call, and wait up to ``timeout`` seconds for the response.
+        """Call the service and wait up to ``timeout`` seconds for the response.
 
         Raises:
             TimeoutError: no response came in time.
         """
         response = self._client.call(request, timeout_sec=timeout)
-        if response is None:  # how Jazzy's client.call says that the time is up
+        if response is None:  # on Jazzy, instead of TimeoutError
             raise TimeoutError(f"client.call: no response within {timeout} s")
         return response
 

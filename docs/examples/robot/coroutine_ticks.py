@@ -1,6 +1,6 @@
-"""A tree whose nodes are coroutines: await the calls, under `asyncio.timeout`.
+"""A tree whose nodes are coroutines that await their calls, under `asyncio.timeout`.
 
-Cancelling a node cancels its call, so a deadline over a subtree needs nothing else.
+Cancelling a node cancels its call, so `asyncio.timeout` also limits a subtree.
 """
 
 import asyncio

@@ -1,4 +1,4 @@
-"""The mission as a tree of py_trees, for the two examples that tick it."""
+"""The mission as a py_trees tree, for the two examples that tick it."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""A hand-written tree for ticks that are plain functions; its leaves come with the examples."""
+"""The inner nodes of a hand-written tree with plain functions as ticks; the examples add leaves."""
 
 import enum
 from typing import Protocol
@@ -17,7 +17,7 @@ class Node(Protocol):
 
 
 class Sequence:
-    """Ticks one child after the other, as long as each ends with `go_on`."""
+    """Ticks its children in order, and continues as long as each ends with `go_on`."""
 
     go_on, stop = Status.SUCCESS, Status.FAILURE
 

@@ -1,4 +1,4 @@
-"""A tree ticked in the loop, whose leaves start calls as tasks and look at them in later ticks."""
+"""A tree ticked in the loop, whose leaves start calls as tasks and check them in later ticks."""
 
 import asyncio
 from typing import Any

@@ -1,4 +1,4 @@
-"""A tree ticked in a thread of its own, whose leaves are `AsyncServiceProxy`s."""
+"""A tree ticked in its own thread, whose leaves use `AsyncServiceProxy`."""
 
 import asyncio
 import time

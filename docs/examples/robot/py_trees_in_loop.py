@@ -1,4 +1,4 @@
-"""A py_trees tree ticked in the loop: it is the loop's turn between two ticks."""
+"""A py_trees tree, ticked in the loop. The loop runs between the ticks."""
 
 import asyncio
 

@@ -1,4 +1,4 @@
-"""A py_trees tree ticked in a thread of its own; the loop is free for everything else."""
+"""A py_trees tree, ticked in its own thread. The loop is free for everything else."""
 
 import asyncio
 

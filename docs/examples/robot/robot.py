@@ -1,7 +1,7 @@
-"""A robot with a dozen services, as a plain rclpy process. The mission of the examples beside it:
+"""A robot with a dozen services, in plain rclpy.
 
-enable the arm and move it home; open the door or, where it is locked, knock; open the gripper,
-switch the lamp on and start the camera at once; save the map.
+The examples run this mission: enable the arm and move it home. Open the door, or knock if it is
+locked. Open the gripper, switch the lamp on and start the camera, all at once. Save the map.
 """
 
 from functools import partial
