@@ -12,18 +12,18 @@ __all__ = ["wrap_future"]
 
 
 def wrap_future(future: Any) -> asyncio.Future[Any]:
-    """Make an asyncio future of any rclpy future, as ``asyncio.wrap_future`` does for threads'.
+    """Wrap an rclpy future in an asyncio future, as ``asyncio.wrap_future`` does for threads.
 
-    Cancelling either side reaches the other. To be called on the thread of a running loop, to
-    which the future returned belongs. An rclpy future is never awaited itself: in asyncio that
-    busy-loops, or raises ``Task got bad yield`` (rclpy issue 1588).
+    Cancelling either future cancels the other. Call it on the thread of a running loop; the result
+    belongs to that loop. Do not await an rclpy future itself: in asyncio that busy-loops, or raises
+    ``Task got bad yield`` (rclpy issue 1588).
 
     Args:
-        future: an ``rclpy.task.Future``, from ``call_async``, an action client, an executor's
-            ``create_task``. Somebody has to spin what completes it.
+        future: an ``rclpy.task.Future``, from ``call_async``, an action client, or an executor's
+            ``create_task``. An executor has to spin the node that completes it.
 
     Raises:
-        TypeError: ``future`` is no rclpy future.
+        TypeError: ``future`` is not an rclpy future.
         UsageError: there is no running loop.
     """
     if not (hasattr(future, "add_done_callback") and hasattr(future, "cancelled")) or isinstance(
@@ -47,7 +47,7 @@ def wrap_future(future: Any) -> asyncio.Future[Any]:
             wrapped.set_result(future.result())
 
     def on_done(_: Any) -> None:
-        # A loop that has been closed has nobody left who waits.
+        # After the loop was closed, there is no one to wait for it.
         with contextlib.suppress(RuntimeError):
             loop.call_soon_threadsafe(arrive)
 

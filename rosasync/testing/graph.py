@@ -42,10 +42,10 @@ class FakeServer:
     """A server in a `FakeGraph`.
 
     Attributes:
-        depth: how many requests its queue holds while responses are held back; what comes then
-            is lost without a word, as in the middleware.
+        depth: how many requests its queue holds while requests are held. Further ones are silently
+            lost, as in the middleware.
         received: the requests handled, in order.
-        lost: how many requests were lost.
+        lost: the number of requests lost.
     """
 
     graph: FakeGraph
@@ -58,7 +58,7 @@ class FakeServer:
     _queue: deque[tuple[FakeClient, int, Any]] = field(default_factory=deque)
 
     def close(self) -> None:
-        """Vanish from the graph, with every request that is queued; idempotent."""
+        """Leave the graph and drop every queued request; idempotent."""
         self._queue.clear()
         if self in self.graph.servers:
             self.graph.servers.remove(self)
@@ -83,7 +83,7 @@ class FakeServer:
 
 @dataclass(frozen=True)
 class FakeHeader:
-    """The header of a fake request: a `rosasync.ports.RequestHeader`, and its own id."""
+    """The header of a request in memory, a `rosasync.ports.RequestHeader`. It is its own id."""
 
     client: FakeClient
     sequence_number: int
@@ -92,7 +92,7 @@ class FakeHeader:
 
     @property
     def request_id(self) -> FakeHeader:
-        """Where the response goes."""
+        """The identity of the request."""
         return self
 
 
@@ -100,7 +100,7 @@ class FakeService(FakeServer):
     """A service that a session serves in a `FakeGraph`: a `rosasync.ports.ServicePort`.
 
     Attributes:
-        sent: the responses sent, in order, as they then were.
+        sent: copies of the responses sent, in order.
     """
 
     handle = None
@@ -118,7 +118,7 @@ class FakeService(FakeServer):
         self._loop = asyncio.get_running_loop()
 
     def send(self, header: Any, response: Any) -> None:
-        """Send a copy of a response; any thread.
+        """Send a copy of a response. From any thread.
 
         Raises:
             Undeliverable: its client is closed.
@@ -133,13 +133,13 @@ class FakeService(FakeServer):
             )
 
     def has_clients(self) -> bool:
-        """Tell whether there is a client of this name."""
+        """Return whether there is a client of this name."""
         return any(
             client.srv_name == self.srv_name for node in self.graph.nodes for client in node.clients
         )
 
     def stop(self) -> None:
-        """Deliver no more requests; idempotent."""
+        """Stop delivering requests; idempotent."""
         self._stopped = True
 
     def _work(self) -> None:
@@ -154,7 +154,7 @@ class FakeService(FakeServer):
 
 
 class FakeGraph:
-    """Servers in memory, the nodes that see them, and what goes wrong between them.
+    """A ROS graph in memory: its servers, its nodes, and faults between them.
 
     Confined to one loop's thread.
     """
@@ -171,37 +171,37 @@ class FakeGraph:
     def serve(
         self, srv_type: Any, srv_name: str, handler: Callable[[Any], Any], *, depth: int = 10
     ) -> FakeServer:
-        """Put a server into the graph; ``handler(request)`` returns the response."""
+        """Add a server to the graph; ``handler(request)`` returns the response."""
         server = FakeServer(self, service_type(srv_type), srv_name, handler, depth)
         self.servers.append(server)
         self.changed()
         return server
 
     def session(self, **options: Any) -> Session:
-        """Make a session in this graph; options as for `rosasync.Session`."""
+        """Create a session in this graph; the options are those of `rosasync.Session`."""
         return FakeSession(self, **options)
 
     def changed(self) -> None:
-        """Tell every node that the graph has changed."""
+        """Report a change of the graph to every node."""
         if self.graph_events:
             for node in tuple(self.nodes):
                 node.on_graph()
 
     def delay_responses(self, seconds: float) -> AbstractContextManager[None]:
-        """Deliver the responses of requests sent meanwhile so much later."""
+        """In this block, delay responses by a number of seconds."""
         return self._meanwhile("delay", seconds)
 
     def drop_requests(self) -> AbstractContextManager[None]:
-        """Lose every request sent meanwhile."""
+        """In this block, lose every request sent."""
         return self._meanwhile("dropping_requests", True)
 
     def drop_responses(self) -> AbstractContextManager[None]:
-        """Lose the response of every request handled meanwhile."""
+        """In this block, lose the response to every request handled."""
         return self._meanwhile("dropping_responses", True)
 
     @contextmanager
     def hold_requests(self) -> Iterator[None]:
-        """Have the servers handle nothing meanwhile, and everything they could queue afterwards."""
+        """In this block, queue the requests, up to each server's depth; handle them afterwards."""
         try:
             with self._meanwhile("holding", True):
                 yield
@@ -241,7 +241,7 @@ class FakeSession(Session):
 
 
 class FakeNode:
-    """A node of a `FakeGraph`: a `rosasync.ports.NodePort`, and all a session asks for."""
+    """A node of a `FakeGraph`: a `rosasync.ports.NodePort`."""
 
     name = "fake"
     bridge = "fake"
@@ -262,17 +262,17 @@ class FakeNode:
         graph.nodes.append(self)
 
     def shutdown(self) -> None:
-        """Have the context go down under the session."""
+        """Shut the context down."""
         self.up = False
         self.on_shutdown()
 
     @property
     def graph_events(self) -> bool:
-        """Whether changes of the graph are told."""
+        """Whether the node reports changes of the graph."""
         return self.graph.graph_events
 
     def ok(self) -> bool:
-        """Tell whether the context is up."""
+        """Return whether the context is up."""
         return self.up
 
     def describe(self, srv_type: Any, srv_name: str, qos: Any) -> Service:
@@ -289,17 +289,17 @@ class FakeNode:
         """Return the name with a leading slash."""
         name = srv_name if srv_name.startswith("/") else f"/{srv_name}"
         if not all(part.isidentifier() for part in name[1:].split("/")):
-            raise InvalidServiceName(f"{srv_name!r} is no service name")
+            raise InvalidServiceName(f"{srv_name!r} is not a valid service name")
         return name
 
     def open_client(self, service: Service, deliver: Deliver) -> FakeClient:
-        """Make a client whose responses go to ``deliver``."""
+        """Create a client that passes its responses to ``deliver``."""
         client = FakeClient(self, service.key, deliver)
         self.clients.append(client)
         return client
 
     def open_service(self, service: Service, deliver: DeliverRequest) -> FakeService:
-        """Make a service whose requests go to ``deliver``."""
+        """Create a service that passes its requests to ``deliver``."""
         opened = FakeService(self.graph, service.srv_type, service.key.srv_name, deliver)
         self.graph.servers.append(opened)
         self.graph.changed()
@@ -314,7 +314,7 @@ class FakeNode:
         return frozenset(map(id, self.graph.find(service.key.srv_type, service.key.srv_name)))
 
     def explain_missing(self, service: Service) -> str:
-        """Describe what the graph holds."""
+        """List the services in the graph."""
         return f"the graph has {sorted(server.srv_name for server in self.graph.servers)}"
 
     def stop(self) -> None:
@@ -339,7 +339,7 @@ class FakeClient:
     Attributes:
         sent: the numbers of the requests sent, in order.
         out: those whose response is still expected.
-        most: how many were out at once at the most.
+        most: most requests outstanding at once.
     """
 
     def __init__(self, node: FakeNode, key: ServiceKey, deliver: Deliver) -> None:
@@ -375,11 +375,11 @@ class FakeClient:
             self._deliver(number, response)
 
     def forget(self, sequence_number: int) -> None:
-        """Expect no response to this request any more."""
+        """Stop expecting a response to this request."""
         self.out.discard(sequence_number)
 
     def ready(self) -> bool:
-        """Tell whether there is a server."""
+        """Return whether there is a server."""
         return bool(self.node.graph.find(self.srv_type, self.srv_name))
 
     def close(self) -> None:
