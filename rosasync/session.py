@@ -17,10 +17,11 @@ import anyio
 from rosasync.aio import until_done
 from rosasync.errors import SessionClosed, UsageError
 from rosasync.gateway import LoopGateway
+from rosasync.handlers import ErrorHook, Handler, OverloadHook
 from rosasync.options import Limits, Retry, SessionOptions, Timeout, check_timeout
 from rosasync.pool import ClientPool, Endpoint, context_shut_down
 from rosasync.portal import Gate, Portal
-from rosasync.server import Handler, ServiceServer
+from rosasync.server import ServiceServer
 from rosasync.statistics import SessionStatistics
 
 if TYPE_CHECKING:
@@ -274,14 +275,14 @@ class Session:
         self,
         srv_type: Any,
         srv_name: str,
-        handler: Handler | None = None,
+        handler: Handler[Any, Any] | None = None,
         *,
         concurrency: int = 100,
         backlog: int = 1000,
         qos: Any = None,
-        on_error: Handler | None = None,
-        on_overload: Handler | None = None,
-    ) -> ServiceServer:
+        on_error: ErrorHook[Any, Any] | None = None,
+        on_overload: OverloadHook[Any, Any] | None = None,
+    ) -> ServiceServer[Any, Any]:
         """Serve a service, from now until the server or the session is closed.
 
         ::
@@ -450,15 +451,17 @@ class _Core:
         )
         self.gate = Gate(self.ros, self.gateway, self.pool, session._options.timeout)
         self.portal = Portal(self.gate)
-        self.servers: dict[ServiceServer, None] = {}
+        self.servers: dict[ServiceServer[Any, Any], None] = {}
         self._ended: asyncio.Task[None] | None = None
         self._session = weakref.ref(session)
         atexit.register(self._exit)
 
-    def serve(self, srv_type: Any, srv_name: str, handler: Any, **options: Any) -> ServiceServer:
+    def serve(
+        self, srv_type: Any, srv_name: str, handler: Any, **options: Any
+    ) -> ServiceServer[Any, Any]:
         """Make a server that ends with the session."""
         self.pool.check_open()
-        server = ServiceServer(
+        server = ServiceServer[Any, Any](
             self.ros, srv_type, srv_name, handler, on_end=self.servers.pop, **options
         )
         self.servers[server] = None
@@ -474,6 +477,9 @@ class _Core:
 
     async def aclose(self) -> None:
         """End everything, once; whoever else closes waits for the same end."""
+        # Before the task is created, because an eager one closes the servers at once.
+        for server in self.servers:
+            server.exclude_caller()
         if self._ended is None:
             self._ended = self.loop.create_task(self._end())
         await until_done(self._ended)
@@ -528,6 +534,8 @@ class _Core:
 
     def _graph_changed(self) -> None:
         self.pool.graph_changed()
+        for server in tuple(self.servers):
+            server.check_port()
 
     def _context_shut_down(self) -> None:
         self.pool.end(context_shut_down)
