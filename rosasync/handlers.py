@@ -77,7 +77,7 @@ class HandlerTasks:
         task = self._loop.create_task(self._run(work))
         if not task.done():
             self._tasks.add(task)
-            task.add_done_callback(self._forget)
+            task.add_done_callback(self._done)
 
     def exclude_caller(self) -> None:
         """Do not wait for the handler whose task calls this, or started the task that does."""
@@ -119,6 +119,13 @@ class HandlerTasks:
             # The task's own context would keep the task alive.
             _handler_task.set(None)
             self._forget(task)
+
+    def _done(self, task: asyncio.Task[None]) -> None:
+        self._forget(task)
+        if not task.cancelled():
+            # Marks it as retrieved. It can only be one that the loop has raised already, because it
+            # ends the program.
+            task.exception()
 
     def _forget(self, task: asyncio.Task[None]) -> None:
         self._tasks.discard(task)

@@ -21,6 +21,7 @@ from tests.support.serving import (
     AnyCall,
     Response,
     ask,
+    discard,
     echo_call,
     echo_of,
     serving,
@@ -161,7 +162,7 @@ class TestErrors:
         await until(lambda: server.statistics().failed == 1)
         assert await ask(session, "/served", "good") == "good"
         assert not task.done()
-        task.cancel()
+        await discard(task)
         statistics = server.statistics()
         assert (statistics.taken, statistics.responded, statistics.unanswered) == (2, 1, 0)
         (record,) = caplog.records
@@ -205,7 +206,7 @@ class TestErrors:
         assert server.statistics().unanswered == 0
         with pytest.raises(UsageError, match="its handler failed"):
             calls[0].respond(Response())
-        task.cancel()
+        await discard(task)
 
     async def test_an_on_error_that_raises(
         self, session: Session, caplog: pytest.LogCaptureFixture
@@ -217,7 +218,7 @@ class TestErrors:
         task = ask(session, "/served", "text", timeout=None)
         await until(lambda: "worse" in caplog.text)
         assert server.statistics().unanswered == 0
-        task.cancel()
+        await discard(task)
 
     @pytest.mark.parametrize("wrong", ["text", SetBool.Response(), True])
     async def test_a_handler_that_returns_the_wrong_type(
@@ -274,7 +275,7 @@ class TestErrors:
         assert [record.message for record in caplog.records] == [
             f"/served: the handler of {_repr_of(1)} was cancelled"
         ]
-        task.cancel()
+        await discard(task)
 
 
 def _repr_of(number: int) -> str:

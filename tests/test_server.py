@@ -26,6 +26,7 @@ from tests.support.serving import (
     Holder,
     Response,
     ask,
+    discard,
     echo_call,
     echo_of,
     settled,
@@ -129,8 +130,7 @@ class TestLimits:
         assert await asyncio.gather(*tasks[:2]) == ["0", "1"]
         await settled(server)
         assert server.statistics().responded == 2
-        for task in tasks[2:]:
-            task.cancel()
+        await discard(*tasks[2:])
 
     async def test_an_on_overload_that_raises(
         self, session: Session, caplog: pytest.LogCaptureFixture
@@ -142,7 +142,7 @@ class TestLimits:
         task = ask(session, "/served", "text", timeout=None)
         await until(lambda: server.statistics().dropped == 1)
         assert "overtaxed" in caplog.text
-        task.cancel()
+        await discard(task)
 
 
 async def test_a_callback_in_a_multithreaded_executor_of_ones_own(bridge: Bridge) -> None:

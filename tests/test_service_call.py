@@ -25,6 +25,7 @@ from tests.support.serving import (
     Holder,
     Response,
     ask,
+    discard,
     echo_of,
 )
 from tests.support.times import LIMIT, TICK, until
@@ -166,9 +167,9 @@ class TestCall:
 
         await asyncio.to_thread(drop)
         await until(lambda: session.statistics().servers[0].dropped == 1)
-        task.cancel()
+        await discard(task)
 
-    async def test_dropped_after_the_close_is_nobodys_fault(self, session: Session) -> None:
+    async def test_dropped_after_the_close_is_no_mistake(self, session: Session) -> None:
         holder = Holder()
         async with session.serve(ECHO, "/held", holder):
             task = ask(session, "/held", "text")
@@ -177,6 +178,20 @@ class TestCall:
         gc.collect()
         with pytest.raises(ServerGone):
             await task
+
+    async def test_given_up(self, session: Session, holder: Holder) -> None:
+        task = ask(session, "/held", "text", timeout=None)
+        (call,) = await holder.held(1)
+        assert not call.settled
+        assert call.give_up("dropped: of no interest")
+        assert not call.give_up("dropped: again")
+        assert call.settled
+        assert not call.responded
+        with pytest.raises(UsageError, match="this call was dropped: of no interest"):
+            call.respond(Response())
+        (statistics,) = session.statistics().servers
+        assert (statistics.dropped, statistics.unanswered) == (1, 0)
+        await discard(task)
 
 
 class TestClients:
@@ -228,5 +243,5 @@ class TestClients:
         call.respond(echo_of(call.request))
         assert server.statistics().undeliverable == 1
         assert server.statistics().responded == 0
-        assert "reaches nobody" in caplog.text
+        assert "cannot be delivered: the service has no client any more" in caplog.text
         assert call.responded

@@ -99,9 +99,9 @@ class Responder:
             raise Unmatched("a client is not quite discovered")
         try:
             self._send(response, request_id)
-        except InvalidHandle as error:
-            raise PortDestroyed(str(error)) from error
         except rclpy_implementation.RCLError as error:
+            if self.destroyed:
+                raise PortDestroyed(str(error)) from error
             raise Undeliverable(str(error)) from error
         except SystemError as error:
             if not isinstance(error.__cause__, RuntimeWarning):

@@ -23,10 +23,11 @@ __all__ = [
     "AnyServer",
     "Holder",
     "Response",
+    "UnmatchedClients",
     "ask",
+    "discard",
     "echo_call",
     "echo_of",
-    "fail_sends",
     "serving",
     "settled",
 ]
@@ -53,6 +54,13 @@ def ask(session: Session, name: str, text: str, **options: Any) -> asyncio.Task[
         return answer_to(await session.call(ECHO, name, request_of(text), **options))
 
     return asyncio.create_task(call())
+
+
+async def discard(*tasks: asyncio.Task[Any]) -> None:
+    """Cancel tasks, and let none of their errors go unseen."""
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
 
 
 class Holder:
@@ -137,17 +145,23 @@ async def settled(server: AnyServer) -> None:
     await until(rests)
 
 
-def fail_sends(server: AnyServer, times: int) -> None:
-    """Have the next so many responses find their client not there yet."""
-    port = server._port
-    send = port.send
-    left = times
+class UnmatchedClients:
+    """Has a server's responses find their clients not discovered yet, for as long as it says.
 
-    def failing(header: Any, response: Any) -> None:
-        nonlocal left
-        left -= 1
-        if left >= 0:
+    Attributes:
+        unmatched: whether sends fail now.
+        attempts: how many have failed.
+    """
+
+    def __init__(self, server: AnyServer) -> None:
+        self.unmatched = True
+        self.attempts = 0
+        port = server._port
+        self._send = port.send
+        port.send = self._fail_or_send  # type: ignore[method-assign]
+
+    def _fail_or_send(self, header: Any, response: Any) -> None:
+        if self.unmatched:
+            self.attempts += 1
             raise Unmatched("not yet")
-        send(header, response)
-
-    port.send = failing  # type: ignore[method-assign]
+        self._send(header, response)
