@@ -69,20 +69,25 @@ class Core:
                 "session.from_thread"
             )
 
-    def serve(self, srv_type: Any, srv_name: str, handler: Any, **options: Any) -> Any:
+    def serve(
+        self, srv_type: Any, srv_name: str, handler: Any, **options: Any
+    ) -> ServiceServer[Any, Any]:
         """Create a server that ends with the session."""
         if self.closed:
             raise session_closed()
         self.pool.check_open()
-        server: ServiceServer[Any, Any] = ServiceServer(
+        server = ServiceServer[Any, Any](
             self.node, srv_type, srv_name, handler, on_end=self.servers.pop, **options
         )
         self.servers[server] = None
         return server
 
     async def aclose(self) -> None:
-        """End everything, once. Everybody who closes waits for the same end."""
+        """End everything, once. All callers wait for the same end."""
         self.closed = True
+        # Before the task is created, because an eager one closes the servers at once.
+        for server in self.servers:
+            server.exclude_caller()
         if self._end_task is None:
             self._end_task = self.loop.create_task(self._end())
         await until_done(self._end_task)
@@ -143,6 +148,8 @@ class Core:
 
     def _graph_changed(self) -> None:
         self.pool.graph_changed()
+        for server in tuple(self.servers):
+            server.check_port()
 
     def _context_shut_down(self) -> None:
         self.pool.end(ContextShutdown)

@@ -447,7 +447,7 @@ class Session:
             UsageError: this process serves or calls another type under this name.
             SessionClosed, ContextShutdown: the session has ended, or has begun to.
         """
-        server: ServiceServer[Any, Any] = self._use().serve(
+        return self._use().serve(
             srv_type,
             srv_name,
             handler,
@@ -457,7 +457,6 @@ class Session:
             on_error=on_error,
             on_overload=on_overload,
         )
-        return server
 
     async def aclose(self) -> None:
         """End the session and everything it started; idempotent.

@@ -13,11 +13,11 @@ from typing import Any
 
 import pytest
 
-from rosasync import ServiceCall, Session, SessionClosed
+from rosasync import Session, SessionClosed
 from tests.support.checks import count_descriptors, count_threads
 from tests.support.clients import ClientProcess, Tally
 from tests.support.echo import ECHO
-from tests.support.serving import FORMS, ask, echo_of, serving, settled
+from tests.support.serving import FORMS, AnyCall, ask, echo_of, serving, settled
 from tests.support.times import LIMIT, TICK, until
 
 numbers = itertools.count()
@@ -97,7 +97,7 @@ class Answerers:
     def __init__(self) -> None:
         self.refused = 0
         self.seen: set[str] = set()
-        self.calls: queue.SimpleQueue[ServiceCall | None] = queue.SimpleQueue()
+        self.calls: queue.SimpleQueue[AnyCall | None] = queue.SimpleQueue()
         self._chance = random.Random(5)
         self._lock = threading.Lock()
         self._threads = [threading.Thread(target=self._answer) for _ in range(4)]
@@ -114,13 +114,13 @@ class Answerers:
             for thread in self._threads:
                 thread.join()
 
-    def take(self, call: ServiceCall) -> None:
+    def take(self, call: AnyCall) -> None:
         """The handler."""
         self.seen.add(caller_of(call.request))
         self.calls.put(call)
 
     def _answer(self) -> None:
-        held: list[ServiceCall] = []
+        held: list[AnyCall] = []
         while True:
             try:
                 call = self.calls.get(timeout=TICK / 10)
@@ -135,7 +135,7 @@ class Answerers:
             self._answer_all(held)
         self._answer_all(held)
 
-    def _answer_all(self, held: list[ServiceCall]) -> None:
+    def _answer_all(self, held: list[AnyCall]) -> None:
         self._chance.shuffle(held)
         while held:
             call = held.pop()
@@ -188,7 +188,7 @@ async def test_closed_and_opened_again_200_times(
 ) -> None:
     seen: set[str] = set()
 
-    async def handler(call: ServiceCall) -> Any:
+    async def handler(call: AnyCall) -> Any:
         seen.add(caller_of(call.request))
         await asyncio.sleep(0)
         return echo_of(call.request)
@@ -219,7 +219,7 @@ async def test_closed_and_opened_again_200_times(
 
 async def test_100_calls_through_a_chain_of_servers(session: Session) -> None:
     def link(number: int) -> Any:
-        async def handler(call: ServiceCall) -> Any:
+        async def handler(call: AnyCall) -> Any:
             return await session.call(ECHO, f"/link_{number + 1}", call.request)
 
         return handler

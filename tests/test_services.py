@@ -10,7 +10,7 @@ import pytest
 from rosasync.ports import Unmatched
 from rosasync.ros import services
 from rosasync.ros.services import Responder
-from rosasync.server import RESEND
+from rosasync.service_call import RESEND
 from tests.support.echo import ECHO
 from tests.support.serving import FORMS
 from tests.support.times import TICK, until

@@ -264,6 +264,11 @@ class DirectService:
             self.close()
             raise RuntimeError("the middleware does not support new-request callbacks")
 
+    @property
+    def destroyed(self) -> bool:
+        """Whether something else than rosasync has destroyed the service."""
+        return self._responder.destroyed
+
     def send(self, header: RequestHeader, response: Any) -> None:
         """Convert and send a response."""
         self._responder.send(response, header.request_id)

@@ -145,6 +145,11 @@ class ExecutorService:
         if self._node.executor is not None:
             self._node.executor.wake()
 
+    @property
+    def destroyed(self) -> bool:
+        """Whether something else than rosasync has destroyed the service."""
+        return self._responder.destroyed
+
     def send(self, header: RequestHeader, response: Any) -> None:
         """Convert and send a response."""
         self._responder.send(response, header.request_id)

@@ -10,13 +10,14 @@ from time import monotonic
 from typing import Any
 
 from rclpy.callback_groups import CallbackGroup
+from rclpy.exceptions import InvalidHandle
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.service import Service
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from rosasync.ports import Undeliverable, Unmatched
+from rosasync.ports import PortDestroyed, Undeliverable, Unmatched
 
 __all__ = ["Responder", "make_service", "qos_of", "take_requests"]
 
@@ -92,18 +93,30 @@ class Responder:
         Raises:
             Undeliverable: it reaches nobody.
             Unmatched: it reaches nobody yet.
+            PortDestroyed: the service was destroyed.
         """
         if self._wary_until and self._awaits_reader():
             raise Unmatched("a client is not quite discovered")
         try:
             self._send(response, request_id)
         except rclpy_implementation.RCLError as error:
+            if self.destroyed:
+                raise PortDestroyed(str(error)) from error
             raise Undeliverable(str(error)) from error
         except SystemError as error:
             if not isinstance(error.__cause__, RuntimeWarning):
                 raise
             self._wary_until = monotonic() + WARY
             raise Unmatched(str(error.__cause__)) from error
+
+    @property
+    def destroyed(self) -> bool:
+        """Whether something else than rosasync has destroyed the service."""
+        try:
+            with self._handle:
+                return False
+        except InvalidHandle:
+            return True
 
     def has_clients(self) -> bool:
         """Tell whether the graph shows a client."""

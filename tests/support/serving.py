@@ -5,22 +5,46 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from diagnostic_msgs.srv import AddDiagnostics
 
+from rosasync import ServiceCall, ServiceServer
+from rosasync.ports import Unmatched
 from tests.support.echo import ECHO, answer_to, request_of
 from tests.support.times import until
 
 if TYPE_CHECKING:
-    from rosasync import ServiceCall, ServiceServer, Session
+    from rosasync import Session
 
-__all__ = ["FORMS", "Holder", "ask", "echo_of", "serving", "settled"]
+__all__ = [
+    "FORMS",
+    "AnyCall",
+    "AnyServer",
+    "Holder",
+    "Response",
+    "UnmatchedClients",
+    "ask",
+    "discard",
+    "echo_call",
+    "echo_of",
+    "serving",
+    "settled",
+]
+
+AnyCall: TypeAlias = ServiceCall[Any, Any]
+AnyServer: TypeAlias = ServiceServer[Any, Any]
+Response = AddDiagnostics.Response
 
 
 def echo_of(request: Any) -> Any:
     """The response that echoes a request."""
-    return AddDiagnostics.Response(success=True, message=request.load_namespace)
+    return Response(success=True, message=request.load_namespace)
+
+
+def echo_call(call: AnyCall) -> Any:
+    """A handler that echoes."""
+    return echo_of(call.request)
 
 
 def ask(session: Session, name: str, text: str, **options: Any) -> asyncio.Task[str]:
@@ -32,16 +56,23 @@ def ask(session: Session, name: str, text: str, **options: Any) -> asyncio.Task[
     return asyncio.create_task(call())
 
 
+async def discard(*tasks: asyncio.Task[Any]) -> None:
+    """Cancel tasks, and let none of their errors go unseen."""
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
+
+
 class Holder:
     """A handler that answers nothing: it keeps the calls, for the test to answer."""
 
     def __init__(self) -> None:
-        self.calls: list[ServiceCall] = []
+        self.calls: list[AnyCall] = []
 
-    def __call__(self, call: ServiceCall) -> None:
+    def __call__(self, call: AnyCall) -> None:
         self.calls.append(call)
 
-    async def held(self, count: int) -> list[ServiceCall]:
+    async def held(self, count: int) -> list[AnyCall]:
         """Wait until so many calls have come."""
         await until(lambda: len(self.calls) >= count)
         return self.calls
@@ -57,21 +88,21 @@ async def _async_pair(request: Any, response: Any) -> Any:
     return _plain_pair(request, response)
 
 
-def _plain_call(call: ServiceCall) -> Any:
+def _plain_call(call: AnyCall) -> Any:
     call.response.message = call.request.load_namespace
     return call.response
 
 
-async def _async_call(call: ServiceCall) -> Any:
+async def _async_call(call: AnyCall) -> Any:
     await asyncio.sleep(0)
     return _plain_call(call)
 
 
-def _responding(call: ServiceCall) -> None:
+def _responding(call: AnyCall) -> None:
     call.respond(echo_of(call.request))
 
 
-async def _responding_later(call: ServiceCall) -> None:
+async def _responding_later(call: AnyCall) -> None:
     asyncio.get_running_loop().call_soon(call.respond, echo_of(call.request))
 
 
@@ -88,7 +119,7 @@ FORMS: dict[str, Callable[..., Any] | None] = {
 
 
 @asynccontextmanager
-async def serving(session: Session, name: str, form: str) -> AsyncIterator[ServiceServer]:
+async def serving(session: Session, name: str, form: str) -> AsyncIterator[AnyServer]:
     """Serve an echo in one of the forms."""
     async with session.serve(ECHO, name, FORMS[form]) as server:
         if FORMS[form] is not None:
@@ -104,7 +135,7 @@ async def serving(session: Session, name: str, form: str) -> AsyncIterator[Servi
     await task
 
 
-async def settled(server: ServiceServer) -> None:
+async def settled(server: AnyServer) -> None:
     """Wait until nothing runs, waits or is unanswered."""
 
     def rests() -> bool:
@@ -112,3 +143,25 @@ async def settled(server: ServiceServer) -> None:
         return now.running == now.waiting == now.unanswered == 0
 
     await until(rests)
+
+
+class UnmatchedClients:
+    """Has a server's responses find their clients not discovered yet, for as long as it says.
+
+    Attributes:
+        unmatched: whether sends fail now.
+        attempts: how many have failed.
+    """
+
+    def __init__(self, server: AnyServer) -> None:
+        self.unmatched = True
+        self.attempts = 0
+        port = server._port
+        self._send = port.send
+        port.send = self._fail_or_send  # type: ignore[method-assign]
+
+    def _fail_or_send(self, header: Any, response: Any) -> None:
+        if self.unmatched:
+            self.attempts += 1
+            raise Unmatched("not yet")
+        self._send(header, response)

@@ -1,0 +1,373 @@
+"""Handlers of a server: their kinds, running them and their hooks, and their tasks."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import inspect
+import logging
+from collections.abc import Awaitable, Callable, Coroutine
+from contextvars import ContextVar
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Generic, TypeAlias, TypeVar
+
+from rosasync.errors import ContextShutdown, SessionClosed
+from rosasync.service_call import CallCounts, ResponseSender, ServiceCall
+from rosasync.typing import RequestT, ResponseT
+
+__all__ = [
+    "ErrorHook",
+    "Handler",
+    "HandlerKind",
+    "HandlerRunner",
+    "HandlerTasks",
+    "OverloadHook",
+    "check_hook",
+    "settle_kind",
+]
+
+Handler: TypeAlias = (
+    Callable[[RequestT, ResponseT], ResponseT | Awaitable[ResponseT]]
+    | Callable[
+        [ServiceCall[RequestT, ResponseT]],
+        ResponseT | Awaitable[ResponseT | None] | None,
+    ]
+)
+"""``handler(request, response)`` or ``handler(call)``, plain or async."""
+
+ErrorHook: TypeAlias = Callable[
+    [ServiceCall[RequestT, ResponseT], Exception],
+    ResponseT | Awaitable[ResponseT | None] | None,
+]
+"""``on_error(call, error)``, plain or async."""
+
+OverloadHook: TypeAlias = Callable[
+    [ServiceCall[RequestT, ResponseT]],
+    ResponseT | Awaitable[ResponseT | None] | None,
+]
+"""``on_overload(call)``, plain or async."""
+
+logger = logging.getLogger("rosasync")
+
+_handler_task: ContextVar[asyncio.Task[Any] | None] = ContextVar("handler_task", default=None)
+"""The task of the handler, or hook, in whose context the code runs. Tasks that a handler starts
+inherit it."""
+
+
+class HandlerTasks:
+    """The tasks of a server's handlers, for its end to wait for. Confined to the loop's thread.
+
+    A handler that waits for the end itself, by closing its server or its session, is neither waited
+    for nor cancelled: it would deadlock.
+    """
+
+    def __init__(self) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._closers: set[asyncio.Task[Any]] = set()
+        # Pending while `wait` waits; completed if the set of closers grows meanwhile.
+        self._closer_added: asyncio.Future[None] | None = None
+
+    def __len__(self) -> int:
+        return len(self._tasks - self._closers)
+
+    def spawn(self, work: Coroutine[Any, Any, None]) -> None:
+        """Run a coroutine in a task."""
+        task = self._loop.create_task(self._run(work))
+        if not task.done():
+            self._tasks.add(task)
+            task.add_done_callback(self._done)
+
+    def exclude_caller(self) -> None:
+        """Do not wait for the handler whose task calls this, or started the task that does."""
+        task = _handler_task.get()
+        if task in self._tasks:
+            self._closers.add(task)
+            if self._closer_added is not None and not self._closer_added.done():
+                self._closer_added.set_result(None)
+
+    async def wait(self, deadline: float | None) -> None:
+        """Wait until every task is done, or until this time of the loop's."""
+        while tasks := self._tasks - self._closers:
+            left = None if deadline is None else deadline - self._loop.time()
+            if left is not None and left <= 0:
+                return
+            self._closer_added = self._loop.create_future()
+            await asyncio.wait(
+                {*tasks, self._closer_added},
+                timeout=left,
+                return_when=asyncio.FIRST_COMPLETED,
+            )
+
+    def cancel(self) -> None:
+        """Cancel every task, in the next turn."""
+        for task in self._tasks - self._closers:
+            # Not at once: a task that has not begun would end without running its handler's
+            # `finally`, or ours.
+            self._loop.call_soon(task.cancel)
+
+    async def _run(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.current_task()
+        assert task is not None
+        # `spawn` is too late for this if the task starts eagerly.
+        self._tasks.add(task)
+        _handler_task.set(task)
+        try:
+            await work
+        finally:
+            # The task's own context would keep the task alive.
+            _handler_task.set(None)
+            self._forget(task)
+
+    def _done(self, task: asyncio.Task[None]) -> None:
+        self._forget(task)
+        if not task.cancelled():
+            # Marks it as retrieved. It can only be one that the loop has raised already, because it
+            # ends the program.
+            task.exception()
+
+    def _forget(self, task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        self._closers.discard(task)
+
+
+@dataclass(frozen=True, slots=True)
+class HandlerKind(Generic[RequestT, ResponseT]):
+    """How to run a handler.
+
+    Attributes:
+        invoke: calls the handler with what it takes.
+        may_defer: whether it may return None, to respond later.
+    """
+
+    invoke: Callable[[ServiceCall[RequestT, ResponseT]], Any]
+    may_defer: bool
+
+
+class HandlerRunner(Generic[RequestT, ResponseT]):
+    """Runs the handler and the hooks of a server, and settles their calls.
+
+    Confined to the loop's thread. It contains every exception that they raise, except those that
+    end the program, such as KeyboardInterrupt.
+
+    Args:
+        kind: how to run the handler; None if the calls are iterated over.
+        on_error: the hook for handlers that failed.
+        sender: what sends the responses.
+        counts: where handlers that defer or fail are counted.
+        tasks: where async handlers run.
+        on_finished: called when an async handler has finished.
+
+    Attributes:
+        running: how many handlers run.
+    """
+
+    def __init__(
+        self,
+        kind: HandlerKind[RequestT, ResponseT] | None,
+        on_error: ErrorHook[RequestT, ResponseT] | None,
+        sender: ResponseSender[ResponseT],
+        counts: CallCounts,
+        tasks: HandlerTasks,
+        on_finished: Callable[[], None],
+    ) -> None:
+        self.running = 0
+        self._kind = kind
+        self._on_error = on_error
+        self._sender = sender
+        self._counts = counts
+        self._tasks = tasks
+        self._on_finished = on_finished
+
+    def start(self, call: ServiceCall[RequestT, ResponseT]) -> None:
+        """Run the handler: a plain one to its end, an async one in a task."""
+        assert self._kind is not None
+        self.running += 1
+        in_task = False
+        try:
+            with _Settling(self, call, self._fail):
+                result = self._kind.invoke(call)
+                if result is not None and inspect.isawaitable(result):
+                    in_task = True
+                    self._tasks.spawn(self._await_handler(call, result))
+                else:
+                    self._finish(call, result)
+        finally:
+            if not in_task:
+                self.running -= 1
+
+    def call_hook(
+        self,
+        call: ServiceCall[RequestT, ResponseT],
+        hook: Callable[..., Any],
+        arguments: tuple[Any, ...],
+        otherwise: Callable[[ServiceCall[RequestT, ResponseT]], None],
+    ) -> None:
+        """Send the response that a hook returns, plain or async.
+
+        Args:
+            call: the call to answer.
+            hook: the hook.
+            arguments: what it is called with.
+            otherwise: called with the call if the hook has failed or returned None.
+        """
+        with _Settling(self, call, self._fail_hook):
+            result = hook(*arguments)
+            if result is not None and inspect.isawaitable(result):
+                self._tasks.spawn(self._await_hook(call, result, otherwise))
+                return
+            if result is not None:
+                call.respond(result)
+        if not call.settled:
+            otherwise(call)
+
+    def cancelled(self, call: ServiceCall[RequestT, ResponseT]) -> None:
+        """Give up a call whose handler, or hook, was cancelled."""
+        call.give_up("given up: its handler was cancelled")
+        if not call.responded:
+            logger.warning("%s: the handler of %r was cancelled", self._sender.name, call)
+
+    async def _await_handler(
+        self, call: ServiceCall[RequestT, ResponseT], pending: Awaitable[Any]
+    ) -> None:
+        try:
+            with _Settling(self, call, self._fail):
+                self._finish(call, await pending)
+        finally:
+            self.running -= 1
+            self._on_finished()
+
+    async def _await_hook(
+        self,
+        call: ServiceCall[RequestT, ResponseT],
+        pending: Awaitable[Any],
+        otherwise: Callable[[ServiceCall[RequestT, ResponseT]], None],
+    ) -> None:
+        with _Settling(self, call, self._fail_hook):
+            result = await pending
+            if result is not None:
+                call.respond(result)
+        if not call.settled:
+            otherwise(call)
+
+    def _finish(self, call: ServiceCall[RequestT, ResponseT], result: Any) -> None:
+        assert self._kind is not None
+        if result is not None:
+            call.respond(result)
+        elif not self._kind.may_defer:
+            raise TypeError("the handler returned None instead of the response")
+        elif not call.settled:
+            self._counts.deferred += 1
+
+    def _fail(self, call: ServiceCall[RequestT, ResponseT], error: Exception) -> None:
+        if self._sender.ending is not None and isinstance(error, SessionClosed | ContextShutdown):
+            logger.warning("%s: the handler of %r outlasted the server", self._sender.name, call)
+            return
+        self._counts.failed += 1
+        logger.error("%s: the handler of %r failed", self._sender.name, call, exc_info=error)
+        if self._on_error is None or call.settled:
+            self._give_up(call)
+        else:
+            self.call_hook(call, self._on_error, (call, error), self._give_up)
+
+    def _give_up(self, call: ServiceCall[RequestT, ResponseT]) -> None:
+        call.give_up("given up: its handler failed", failed=True)
+
+    def _fail_hook(self, call: ServiceCall[RequestT, ResponseT], error: Exception) -> None:
+        logger.error(
+            "%s: on_error or on_overload failed for %r", self._sender.name, call, exc_info=error
+        )
+
+
+class _Settling(Generic[RequestT, ResponseT]):
+    """Contains what a handler or a hook raises, plain or async: the one place that decides.
+
+    A context manager of its own, because it runs for every request and `contextlib` is slow.
+    """
+
+    __slots__ = ("_call", "_fail", "_runner")
+
+    def __init__(
+        self,
+        runner: HandlerRunner[RequestT, ResponseT],
+        call: ServiceCall[RequestT, ResponseT],
+        fail: Callable[[ServiceCall[RequestT, ResponseT], Exception], None],
+    ) -> None:
+        self._runner = runner
+        self._call = call
+        self._fail = fail
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> bool:
+        if isinstance(exc, asyncio.CancelledError):
+            self._runner.cancelled(self._call)
+        elif isinstance(exc, Exception):
+            self._fail(self._call, exc)
+        else:
+            return False
+        return True
+
+
+def settle_kind(
+    handler: Handler[RequestT, ResponseT] | None,
+) -> HandlerKind[RequestT, ResponseT] | None:
+    """Decide how to run a handler, by the number of its required arguments.
+
+    Raises:
+        TypeError: it takes neither a call nor request and response.
+    """
+    if handler is None:
+        return None
+    if inspect.isclass(handler):
+        raise TypeError(
+            f"a handler is a function or a coroutine function, not the class {handler!r}"
+        )
+    if not callable(handler):
+        raise TypeError(f"a handler must be callable, not {type(handler).__name__}")
+    code: Any = handler
+    while isinstance(code, functools.partial):
+        code = code.func
+    for function in (code, type(code).__call__):
+        if inspect.isgeneratorfunction(function) or inspect.isasyncgenfunction(function):
+            raise TypeError(f"a handler returns its response, it does not yield: {handler!r}")
+    invoke: Callable[..., Any] = handler
+    match _count_required(handler):
+        case 1:
+            return HandlerKind(invoke, may_defer=True)
+        case 2:
+            return HandlerKind(lambda call: invoke(call.request, call.response), may_defer=False)
+    raise TypeError(f"a handler takes (call) or (request, response): {handler!r} does not")
+
+
+HookT = TypeVar("HookT")
+
+
+def check_hook(name: str, hook: HookT) -> HookT:
+    """Return a hook, or None.
+
+    Raises:
+        TypeError: it is not callable.
+    """
+    if hook is not None and not callable(hook):
+        raise TypeError(f"{name} must be callable, not {type(hook).__name__}")
+    return hook
+
+
+def _count_required(handler: Callable[..., Any]) -> int | None:
+    """Return the number of required positional arguments; None if it needs others too."""
+    try:
+        parameters = inspect.signature(handler).parameters.values()
+    except ValueError:
+        return None
+    required = [p for p in parameters if p.default is p.empty]
+    if any(p.kind is p.KEYWORD_ONLY for p in required):
+        return None
+    return sum(p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD) for p in required)

@@ -1,0 +1,462 @@
+"""ServiceCall: one request to a server, and the sending of its response."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import threading
+import warnings
+from collections.abc import Callable, Coroutine
+from contextlib import suppress
+from copy import deepcopy
+from dataclasses import dataclass
+from time import monotonic
+from typing import TYPE_CHECKING, Any, Generic
+
+from rosasync.errors import ContextShutdown, UsageError
+from rosasync.ports import PortDestroyed, Undeliverable, Unmatched
+from rosasync.typing import RequestT, ResponseT
+
+if TYPE_CHECKING:
+    from rosasync.ports import RequestHeader, ServicePort
+    from rosasync.server import ServiceServer
+
+__all__ = ["CallCounts", "RequestInfo", "ResponseSender", "ServiceCall", "service_destroyed"]
+
+logger = logging.getLogger("rosasync")
+
+RESEND = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 1.6, 1.6, 1.6, 1.6)
+"""Seconds to wait before each further attempt to send a response to a client that the middleware
+has not discovered completely."""
+MAX_UNSENT = 1000
+"""Most responses of a server that wait to be sent again."""
+LATE = 0.1
+"""Seconds after which the client of a request may be gone, so that the graph is checked."""
+
+_ANSWERED = "answered"
+
+
+@dataclass(frozen=True, slots=True)
+class RequestInfo:
+    """What the middleware reports about a request.
+
+    Attributes:
+        sequence_number: counts the requests of one client; two clients may use the same.
+        source_timestamp: when it was sent, in ns of the system clock; None if unknown.
+        received_timestamp: when it arrived, in ns; None if unknown.
+    """
+
+    sequence_number: int
+    source_timestamp: int | None
+    received_timestamp: int | None
+
+
+class ServiceCall(Generic[RequestT, ResponseT]):
+    """One request, and the means to answer it, once.
+
+    Keep it to respond later, in any order, from any task or thread. A call that is dropped
+    unanswered is a ``ResourceWarning``.
+
+    Attributes:
+        request: the request message.
+        server: the server that took it.
+    """
+
+    __slots__ = (
+        "__weakref__",
+        "_header",
+        "_outcome",
+        "_received",
+        "_response",
+        "_sender",
+        "request",
+        "server",
+    )
+
+    def __init__(
+        self,
+        server: ServiceServer[RequestT, ResponseT],
+        request: RequestT,
+        header: RequestHeader,
+        sender: ResponseSender[ResponseT],
+    ) -> None:
+        self.server = server
+        self.request = request
+        self._header = header
+        self._sender = sender
+        self._response: ResponseT | None = None
+        # None until the call is settled; changed under the sender's lock.
+        self._outcome: str | None = None
+        self._received = monotonic()
+
+    def __repr__(self) -> str:
+        number = self._header.request_id.sequence_number
+        return f"<ServiceCall {self._sender.name} #{number} {self._outcome or 'unanswered'}>"
+
+    def __del__(self) -> None:
+        if self._outcome is None and self._sender.count_collected():
+            warnings.warn(
+                f"{self._sender.name}: a call was dropped unanswered",
+                ResourceWarning,
+                source=self,
+                stacklevel=2,
+            )
+
+    @property
+    def info(self) -> RequestInfo:
+        """The sequence number and the timestamps."""
+        header = self._header
+        return RequestInfo(
+            header.request_id.sequence_number,
+            _timestamp(header.source_timestamp),
+            _timestamp(header.received_timestamp),
+        )
+
+    @property
+    def response(self) -> ResponseT:
+        """A response to fill: created at the first access, the same one afterwards."""
+        if self._response is None:
+            self._response = self._sender.response_type()
+        return self._response
+
+    @property
+    def responded(self) -> bool:
+        """Whether it has been answered."""
+        return self._outcome == _ANSWERED
+
+    @property
+    def settled(self) -> bool:
+        """Whether it has been answered or given up."""
+        return self._outcome is not None
+
+    def respond(self, response: ResponseT) -> None:
+        """Convert the response and send it, at once and in the calling thread.
+
+        From any thread. The message may be changed or reused afterwards. If the client is gone, the
+        response is logged and counted as undeliverable, and no error is raised.
+
+        Args:
+            response: a message of the service's response type.
+
+        Raises:
+            TypeError: it is something else; the call can still be answered.
+            UsageError: the call was answered before, or given up because its handler failed.
+            SessionClosed, ContextShutdown: the server has ended.
+        """
+        sender = self._sender
+        sender.check_type(response)
+        with sender.lock:
+            sender.check_open()
+            if self._outcome is not None:
+                raise UsageError(f"{sender.name}: this call was {self._outcome}")
+            self._outcome = _ANSWERED
+            sender.begin()
+        try:
+            late = monotonic() - self._received > LATE
+            sender.send(self, self._header, response, late=late)
+        except BaseException:
+            self._outcome = None
+            raise
+
+    def give_up(self, reason: str, *, failed: bool = False) -> bool:
+        """Leave the request unanswered for good. From any thread.
+
+        Args:
+            reason: what became of the call, for the errors of a later `respond`: "dropped: …".
+            failed: whether its handler failed. If not, the call is counted as dropped.
+
+        Returns:
+            Whether this settled the call. False if it is settled already, or the server has ended.
+        """
+        sender = self._sender
+        with sender.lock:
+            if self._outcome is not None or sender.ending is not None:
+                return False
+            self._outcome = reason
+            sender.count_unanswered(failed=failed)
+        return True
+
+
+@dataclass(slots=True)
+class CallCounts:
+    """What has happened to the calls of a server.
+
+    The first four are changed on the loop's thread, the others under the sender's lock.
+    """
+
+    taken: int = 0
+    rejected: int = 0
+    deferred: int = 0
+    failed: int = 0
+    responded: int = 0
+    undeliverable: int = 0
+    dropped: int = 0
+    failed_unanswered: int = 0
+
+    @property
+    def unanswered(self) -> int:
+        """How many calls are neither answered nor given up."""
+        settled = self.responded + self.undeliverable + self.dropped + self.failed_unanswered
+        return self.taken - settled
+
+
+class ResponseSender(Generic[ResponseT]):
+    """Sends the responses of a server, from any thread, and ends between two sends.
+
+    Attributes:
+        name: the resolved service name.
+        response_type: the class of the responses.
+        lock: protects the outcome of every call, and the state here. Held for a few assignments,
+            never across a send. Reentrant, because the garbage collector may run any ``__del__``
+            under it.
+        ending: creates the error for later responses, once there is one.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        type_name: str,
+        response_type: type[ResponseT],
+        port: ServicePort,
+        counts: CallCounts,
+        spawn: Callable[[Coroutine[Any, Any, None]], None],
+        on_destroyed: Callable[[], None],
+    ) -> None:
+        self.name = name
+        self.response_type = response_type
+        self.lock = threading.RLock()
+        self.ending: Callable[[], Exception] | None = None
+        self._type_name = type_name
+        self._port = port
+        self._counts = counts
+        self._loop = asyncio.get_running_loop()
+        self._thread = threading.get_ident()
+        self._resender = Resender(self, spawn)
+        self._on_destroyed = on_destroyed
+        self._idle = threading.Condition(self.lock)
+        self._sending = 0
+
+    def check_open(self) -> None:
+        """Raise the error for later responses, if there is one."""
+        if self.ending is not None:
+            raise self.ending()
+
+    def check_type(self, response: ResponseT) -> None:
+        """Raise `TypeError` unless this is a response of the service."""
+        if not isinstance(response, self.response_type):
+            raise TypeError(
+                f"{self.name}: a response of {self._type_name} is a "
+                f"{_name_of(self.response_type)}, not a {_name_of(type(response))}"
+            )
+
+    def begin(self) -> None:
+        """Announce a `send`, under the lock: `close` waits for it."""
+        self._sending += 1
+
+    def send(self, call: object, header: RequestHeader, response: ResponseT, *, late: bool) -> None:
+        """Send the response of a call, or have it sent again later. Call `begin` first.
+
+        Args:
+            call: the call, for the log.
+            header: the header of its request.
+            response: the response.
+            late: whether the client may have left meanwhile.
+
+        Raises:
+            ContextShutdown: the rclpy service was destroyed.
+        """
+        if self._try(call, header, response, late):
+            return
+        unsent = _Unsent(call, header, deepcopy(response))
+        try:
+            if threading.get_ident() == self._thread:
+                self._resender.add(unsent)
+            else:
+                self._loop.call_soon_threadsafe(self._resender.add, unsent)
+        except RuntimeError:
+            self.give_up(call, "the event loop is closed")
+
+    def send_again(self, call: object, header: RequestHeader, response: ResponseT) -> bool:
+        """Send a response that could not be sent before.
+
+        Returns:
+            False if its client cannot get it yet.
+
+        Raises:
+            SessionClosed, ContextShutdown: the server has ended.
+        """
+        with self.lock:
+            self.check_open()
+            self.begin()
+        return self._try(call, header, response, late=True)
+
+    def give_up(self, call: object, reason: object) -> None:
+        """Count and log a response that cannot be delivered."""
+        with self.lock:
+            self._counts.undeliverable += 1
+        logger.warning("%s: the response of %r cannot be delivered: %s", self.name, call, reason)
+
+    def count_unanswered(self, *, failed: bool) -> None:
+        """Count a call that was given up. Call it under the lock."""
+        if failed:
+            self._counts.failed_unanswered += 1
+        else:
+            self._counts.dropped += 1
+
+    def count_collected(self) -> bool:
+        """Count a call that was garbage-collected unanswered, in a later turn of the loop.
+
+        Returns:
+            False if the server, or the loop, had ended before, so that this is no mistake.
+        """
+        # No lock is taken here: the garbage collector runs under locks that threads hold already.
+        if self.ending is not None:
+            return False
+        try:
+            self._loop.call_soon_threadsafe(self._count_dropped)
+        except RuntimeError:
+            return False
+        return True
+
+    def shut(self, ending: Callable[[], Exception]) -> None:
+        """Refuse further responses; the first ``ending`` stays."""
+        with self.lock:
+            if self.ending is None:
+                self.ending = ending
+
+    def close(self, ending: Callable[[], Exception]) -> None:
+        """Refuse further responses, and wait for those being sent; blocks that long.
+
+        Calls that are unanswered then are counted as dropped.
+        """
+        self.shut(ending)
+        with self.lock:
+            self._idle.wait_for(lambda: not self._sending)
+            self._counts.dropped += self._counts.unanswered
+
+    def _count_dropped(self) -> None:
+        with self.lock:
+            # `close` counts what is unanswered then.
+            if self.ending is None:
+                self._counts.dropped += 1
+
+    def _try(self, call: object, header: RequestHeader, response: ResponseT, late: bool) -> bool:
+        sent = False
+        try:
+            self._port.send(header, response)
+            if late and not self._port.has_clients():
+                raise Undeliverable("the service has no client any more")
+            sent = True
+        except Unmatched:
+            return False
+        except Undeliverable as error:
+            self.give_up(call, error)
+        except PortDestroyed as error:
+            # At once, so that no handler is taken to have failed before the server has ended.
+            self.shut(lambda: service_destroyed(self.name))
+            with suppress(RuntimeError):
+                self._loop.call_soon_threadsafe(self._on_destroyed)
+            raise service_destroyed(self.name) from error
+        finally:
+            with self.lock:
+                self._counts.responded += sent
+                self._sending -= 1
+                if self.ending is not None:
+                    self._idle.notify_all()
+        return True
+
+
+@dataclass(slots=True, eq=False)
+class _Unsent:
+    """A response that its client could not get yet."""
+
+    call: object
+    header: RequestHeader
+    response: Any
+    attempts: int = 0
+    due: float = 0.0
+
+
+class Resender:
+    """Sends responses again whose clients the middleware has not discovered completely.
+
+    Confined to the loop's thread. One task serves all responses of a server, and ends when none is
+    left. The first attempt follows soon. Later ones are rarer, because an attempt may block for
+    0.1 s if the port does not know the client yet.
+    """
+
+    def __init__(
+        self,
+        sender: ResponseSender[Any],
+        spawn: Callable[[Coroutine[Any, Any, None]], None],
+    ) -> None:
+        self._sender = sender
+        self._spawn = spawn
+        self._loop = asyncio.get_running_loop()
+        # In the order in which they came. The task runs as long as there are any.
+        self._unsent: dict[_Unsent, None] = {}
+
+    def add(self, unsent: _Unsent) -> None:
+        """Send a response again, for about ten seconds. The oldest is given up beyond MAX_UNSENT.
+
+        Raises:
+            RuntimeError: the loop is closed.
+        """
+        if self._sender.ending is not None:
+            return
+        idle = not self._unsent
+        if len(self._unsent) >= MAX_UNSENT:
+            oldest = next(iter(self._unsent))
+            del self._unsent[oldest]
+            self._sender.give_up(oldest.call, f"{MAX_UNSENT} later ones wait to be sent again")
+        unsent.due = self._loop.time() + RESEND[0]
+        self._unsent[unsent] = None
+        if idle:
+            self._spawn(self._run())
+
+    async def _run(self) -> None:
+        try:
+            while self._unsent:
+                # No longer than the shortest delay, since responses may be added meanwhile.
+                await asyncio.sleep(RESEND[0])
+                now = self._loop.time()
+                for unsent in [unsent for unsent in self._unsent if unsent.due <= now]:
+                    if unsent in self._unsent and not self._settle(unsent):
+                        return
+                    await asyncio.sleep(0)
+        finally:
+            self._unsent.clear()
+
+    def _settle(self, unsent: _Unsent) -> bool:
+        """Try once more to send a response; return whether the server is still open."""
+        sender = self._sender
+        if sender.ending is not None:
+            return False
+        unsent.attempts += 1
+        try:
+            sent = sender.send_again(unsent.call, unsent.header, unsent.response)
+        except Exception as error:
+            sent = True
+            if sender.ending is not None:
+                return False
+            sender.give_up(unsent.call, error)
+        if not sent and unsent.attempts < len(RESEND):
+            unsent.due = self._loop.time() + RESEND[unsent.attempts]
+            return True
+        del self._unsent[unsent]
+        if not sent:
+            sender.give_up(unsent.call, "its client was not discovered in time")
+        return True
+
+
+def service_destroyed(name: str) -> ContextShutdown:
+    """Return the error for a service that something else than rosasync has destroyed."""
+    return ContextShutdown(f"{name}: the rclpy service was destroyed under the server")
+
+
+def _timestamp(nanoseconds: int) -> int | None:
+    return nanoseconds if nanoseconds > 0 else None
+
+
+def _name_of(kind: type) -> str:
+    return f"{kind.__module__}.{kind.__qualname__}"

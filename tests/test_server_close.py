@@ -1,0 +1,266 @@
+"""Servers that end: closed, with the session, with the context, with the service."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from rclpy.qos import QoSProfile
+from rclpy.service import Service
+from std_srvs.srv import Trigger
+
+from rosasync import (
+    ContextShutdown,
+    ServerGone,
+    ServerStatistics,
+    ServiceServer,
+    Session,
+    SessionClosed,
+    UsageError,
+)
+from tests.support.echo import ECHO
+from tests.support.serving import (
+    AnyCall,
+    Holder,
+    Response,
+    ask,
+    echo_call,
+    echo_of,
+)
+from tests.support.times import LIMIT, TICK, until
+
+if TYPE_CHECKING:
+    from tests.conftest import Bridge
+
+
+class TestClose:
+    async def test_handlers_finish(self, session: Session) -> None:
+        gate = asyncio.Event()
+
+        async def handler(call: AnyCall) -> Any:
+            await gate.wait()
+            return echo_of(call.request)
+
+        server = session.serve(ECHO, "/served", handler, concurrency=2)
+        tasks = [ask(session, "/served", str(n)) for n in range(5)]
+        await until(lambda: server.statistics().taken == 5)
+        closing = [asyncio.create_task(server.aclose()) for _ in range(2)]
+        await asyncio.sleep(TICK)
+        assert server.closed
+        assert not closing[0].done()
+        gate.set()
+        assert await asyncio.gather(*tasks) == [str(n) for n in range(5)]
+        await asyncio.gather(*closing)
+        await server.aclose()
+        assert server.statistics().responded == 5
+        assert session.statistics().servers == ()
+
+    async def test_the_rest_is_cancelled_after_the_deadline(
+        self, session: Session, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        cancelled: list[str] = []
+
+        async def handler(call: AnyCall) -> Any:
+            try:
+                await asyncio.Event().wait()
+            except asyncio.CancelledError:
+                cancelled.append(call.request.load_namespace)
+                raise
+
+        server = session.serve(ECHO, "/served", handler, concurrency=2)
+        tasks = [ask(session, "/served", str(n)) for n in range(3)]
+        await until(lambda: server.statistics().taken == 3)
+        await server.aclose(2 * TICK)
+        assert sorted(cancelled) == ["0", "1"]
+        assert server.statistics().dropped == 3
+        for task in tasks:
+            with pytest.raises(ServerGone):
+                await task
+        assert sum("was cancelled" in message for message in caplog.messages) == 2
+        assert sum("1 requests waiting" in message for message in caplog.messages) == 1
+
+    async def test_no_request_is_taken_meanwhile(self, session: Session) -> None:
+        gate = asyncio.Event()
+
+        async def handler(call: AnyCall) -> Any:
+            await gate.wait()
+            return echo_of(call.request)
+
+        server = session.serve(ECHO, "/served", handler)
+        task = ask(session, "/served", "first")
+        await until(lambda: server.statistics().taken == 1)
+        closing = asyncio.create_task(server.aclose())
+        await asyncio.sleep(0)
+        late = ask(session, "/served", "late")
+        await asyncio.sleep(TICK)
+        assert server.statistics().taken == 1
+        gate.set()
+        assert await task == "first"
+        await closing
+        with pytest.raises(ServerGone):
+            await late
+
+    async def test_a_handler_that_closes_its_server(self, session: Session) -> None:
+        closed = asyncio.Event()
+
+        async def handler(call: AnyCall) -> None:
+            call.respond(echo_of(call.request))
+            await call.server.aclose()
+            closed.set()
+
+        session.serve(ECHO, "/served", handler)
+        assert await ask(session, "/served", "text") == "text"
+        await asyncio.wait_for(closed.wait(), 10 * TICK)
+
+    async def test_a_handler_that_ignores_its_cancellation(
+        self, session: Session, caplog: pytest.LogCaptureFixture, monkeypatch: Any
+    ) -> None:
+        monkeypatch.setattr("rosasync.server.CANCEL_TIMEOUT", TICK)
+        gate = asyncio.Event()
+        ended: list[object] = []
+
+        async def handler(call: AnyCall) -> Any:
+            while not gate.is_set():
+                try:
+                    await gate.wait()
+                except asyncio.CancelledError:
+                    continue
+            try:
+                call.respond(echo_of(call.request))
+            except SessionClosed as error:
+                ended.append(error)
+                raise
+
+        server = session.serve(ECHO, "/served", handler)
+        task = ask(session, "/served", "text")
+        await until(lambda: server.statistics().running == 1)
+        await server.aclose(0)
+        assert "1 handlers ignore their cancellation" in caplog.text
+        gate.set()
+        await until(lambda: server.statistics().running == 0)
+        assert len(ended) == 1
+        assert server.statistics().failed == 0
+        with pytest.raises(ServerGone):
+            await task
+
+    async def test_what_it_tells_afterwards(self, session: Session) -> None:
+        async with session.serve(Trigger, "served", lambda call: call.response) as server:
+            assert isinstance(server, ServiceServer)
+            assert isinstance(server.handle, Service)
+            assert not server.closed
+            assert server.qos.depth == 1000
+        assert server.closed
+        assert server.srv_name == "/served"
+        assert server.srv_type == "std_srvs/srv/Trigger"
+        assert isinstance(server.qos, QoSProfile)
+        assert server.qos.depth == 1000
+        assert repr(server) == "<ServiceServer /served [std_srvs/srv/Trigger] closed>"
+        assert server.statistics() == ServerStatistics("/served")
+        with pytest.raises(SessionClosed):
+            _ = server.handle
+
+    async def test_its_qos(self, session: Session) -> None:
+        server = session.serve(ECHO, "/served", echo_call, qos=QoSProfile(depth=7))
+        assert server.qos.depth == 7
+
+    async def test_from_elsewhere(self, session: Session) -> None:
+        server = session.serve(ECHO, "/served", echo_call)
+        with pytest.raises(UsageError):
+            await asyncio.to_thread(asyncio.run, server.aclose())
+        assert not server.closed
+
+    async def test_its_end_waits_for_a_send_under_way(self, session: Session) -> None:
+        holder = Holder()
+        server = session.serve(ECHO, "/held", holder)
+        task = ask(session, "/held", "text")
+        (call,) = await holder.held(1)
+        port = server._port
+        send, close = port.send, port.close
+        sending, go_on = threading.Event(), threading.Event()
+        order: list[str] = []
+
+        def slow_send(header: Any, response: Any) -> None:
+            sending.set()
+            assert go_on.wait(LIMIT)
+            order.append("sent")
+            send(header, response)
+
+        def noted_close() -> None:
+            order.append("closed")
+            close()
+
+        port.send, port.close = slow_send, noted_close  # type: ignore[method-assign]
+        sender = asyncio.create_task(asyncio.to_thread(call.respond, echo_of(call.request)))
+        await asyncio.to_thread(sending.wait, LIMIT)
+
+        def release() -> None:
+            deadline = time.monotonic() + LIMIT
+            while server._sender.ending is None and time.monotonic() < deadline:
+                time.sleep(TICK / 10)
+            order.append("closing")
+            go_on.set()
+
+        releaser = threading.Thread(target=release)
+        releaser.start()
+        await server.aclose()
+        releaser.join()
+        await sender
+        assert order == ["closing", "sent", "closed"]
+        assert await task == "text"
+
+    async def test_with_the_session_its_handlers_may_still_call(self, bridge: Bridge) -> None:
+        async with Session("client", bridge=bridge) as client:
+            async with Session("closing", bridge=bridge) as session:
+                gate = asyncio.Event()
+
+                async def handler(call: AnyCall) -> Any:
+                    await gate.wait()
+                    return await session.call(ECHO, "/elsewhere", call.request)
+
+                client.serve(ECHO, "/elsewhere", echo_call)
+                server = session.serve(ECHO, "/served", handler)
+                task = ask(client, "/served", "text")
+                await until(lambda: server.statistics().running == 1)
+                closing = asyncio.create_task(session.aclose())
+                await asyncio.sleep(0)
+                with pytest.raises(SessionClosed):
+                    session.serve(ECHO, "/late", echo_call)
+                gate.set()
+                assert await task == "text"
+                await closing
+            assert server.closed
+
+    async def test_with_the_context(self, bridge: Bridge) -> None:
+        async with Session("doomed", bridge=bridge) as session:
+            holder = Holder()
+            server = session.serve(ECHO, "/held", holder)
+            iterated = session.serve(ECHO, "/iterated")
+            waiting = asyncio.create_task(anext(iterated))
+            task = ask(session, "/held", "text")
+            (call,) = await holder.held(1)
+            await asyncio.to_thread(session.node.context.try_shutdown)
+            with pytest.raises(ContextShutdown):
+                await task
+            with pytest.raises(ContextShutdown):
+                await asyncio.wait_for(waiting, LIMIT)
+            await until(lambda: server.closed)
+            with pytest.raises(ContextShutdown):
+                call.respond(Response())
+            with pytest.raises(ContextShutdown):
+                session.serve(ECHO, "/late", echo_call)
+            await server.aclose()
+
+    async def test_with_a_session_that_is_dropped(self, bridge: Bridge) -> None:
+        session = Session("dropped", bridge=bridge)
+        await session.__aenter__()
+        server = session.serve(ECHO, "/served", echo_call)
+        assert await ask(session, "/served", "text") == "text"
+        sessions = [session]
+        del session
+        with pytest.warns(ResourceWarning, match="unclosed"):
+            sessions.clear()
+        await until(lambda: server.closed)
+        assert server.statistics().responded == 1
