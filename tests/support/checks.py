@@ -1,4 +1,4 @@
-"""What a test looks at when the calls are over."""
+"""What a test checks when the calls are over."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ __all__ = ["assert_clean", "check_call", "count_descriptors", "count_threads", "
 
 
 async def check_call(session: Session, name: str, text: str, **options: Any) -> None:
-    """Call a service of the echoing type and hold that the answer is to this very request."""
+    """Call a service of the echoing type and check that the response is to this request."""
     response = await session.call(ECHO, name, request_of(text), **options)
     assert answer_to(response) == text
 
 
 async def assert_clean(session: Session) -> None:
-    """Wait until no place in any window is taken, and hold that nothing else is left either."""
+    """Wait until no request is outstanding, and check that nothing else is left either."""
 
     def settled() -> bool:
         now = session.pool.statistics()
@@ -37,15 +37,15 @@ async def assert_clean(session: Session) -> None:
 
 
 def pending_in_rclpy(session: Session) -> int:
-    """How many requests rclpy itself still keeps an entry for."""
+    """Return how many requests rclpy itself still keeps an entry for."""
     return sum(len(client._pending_requests) for client in session.node.clients)
 
 
 def count_descriptors() -> int:
-    """How many files this process has open."""
+    """Return how many files this process has open."""
     return len(os.listdir("/proc/self/fd"))
 
 
 def count_threads() -> int:
-    """How many threads this process has, the middleware's too."""
+    """Return how many threads this process has, including the middleware's."""
     return len(os.listdir("/proc/self/task"))
