@@ -1,4 +1,4 @@
-"""The main paths once more, on asyncio's own loop and on uvloop."""
+"""The main paths, on asyncio's own loop and on uvloop."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.asyncio(loop_factories=["asyncio", "uvloop"])
 
 @pytest.fixture(autouse=True)
 async def right_loop(request: pytest.FixtureRequest) -> None:
-    """The parametrisation does what it says."""
+    """Check that the test runs on the loop of its parametrization."""
     is_uvloop = isinstance(asyncio.get_running_loop(), uvloop.Loop)
     assert is_uvloop == ("uvloop" in request.node.callspec.id)
 

@@ -102,7 +102,8 @@ async def test_many_proxies_ticked_from_a_thread(
     with ThreadPoolExecutor(1) as threads:
         await asyncio.get_running_loop().run_in_executor(threads, tick_all)
     await until(
-        lambda: all(leaf.proxy.get_state() is ProxyState.RESPONSE_READY for leaf in leaves), PATIENCE
+        lambda: all(leaf.proxy.get_state() is ProxyState.RESPONSE_READY for leaf in leaves),
+        PATIENCE,
     )
     for leaf in leaves:
         leaf.take()

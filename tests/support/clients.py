@@ -1,7 +1,7 @@
 """A process of stock rclpy clients: ``python -m tests.support.clients``.
 
-It calls services of the echoing type with ``client.call_async`` or, in threads, ``client.call``, and
-reports how many responses came, were wrong, or never came.
+It calls services of the echoing type with ``client.call_async`` or, in threads, ``client.call``.
+It reports how many responses came, were wrong, or never came.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """What is lost when one process floods a stock server and another is slow to take its responses.
 
-``python -m tests.support.flood`` measures it for rosasync and for rclpy's own ``client.call_async``,
-and prints a table. Nothing is asserted: without ``Retry`` the middleware may drop requests and
+``python -m tests.support.flood`` measures it for rosasync and for ``client.call_async``, and prints
+a table. Nothing is asserted: without ``Retry`` the middleware may drop requests and
 responses, and how many depends on the machine.
 """
 

@@ -29,8 +29,8 @@ __all__ = ["Delay", "ServerProcess", "running"]
 T = TypeVar("T")
 
 Delay = float | tuple[float, float] | Literal["hold", "never"] | None
-"""When a request is answered: at once (None), after a number of seconds, after a random time between
-two numbers of seconds, when `ServerProcess.release` is called, or never."""
+"""When a request is answered: at once (None), after a number of seconds, after a random number of
+seconds between two, when `ServerProcess.release` is called, or never."""
 
 
 @contextmanager
