@@ -38,6 +38,9 @@ PERIOD = 0.001
 PENDING_TIMEOUT = 120.0
 """Seconds for which a call to a server that does not answer stays pending."""
 
+STOPPED_TIMEOUT = 0.05
+"""Seconds for a call to a server that has stopped."""
+
 BATCH = 100
 """Looks at a state for one sample: one alone takes less time than the clock."""
 
@@ -64,6 +67,8 @@ class Ticking(Protocol):
 
 def call_timeout(work: Work) -> float:
     """Seconds for a call: those of a slow server are to stay pending."""
+    if work.server == "stopped":
+        return STOPPED_TIMEOUT
     return PENDING_TIMEOUT if any(work.delays) else CALL_TIMEOUT
 
 
@@ -110,12 +115,13 @@ def watch_rclpy() -> Stamps:
 class Ticked(ABC):
     """The measures, each written as a generator that yields where a tick is over.
 
-    ``tick``: how long a tick takes in which every leaf looks at a pending call. ``state``: one
+    ``tick``: how long a tick takes in which every leaf looks at a pending call. ``again``: how long
+    one takes in which every leaf looks at its call, and calls again if it has ended. ``state``: one
     look at the state of a pending call. ``decide``: from the leaf's decision to the request in the
     middleware's hands. ``see``: from the response out of the middleware's hands to the tick that
     sees it, with ticks back to back. ``rate``: calls by as many leaves as there are, each starting
-    the next call in the tick that sees the answer. ``added``: threads and descriptors in use with
-    a call pending in every leaf.
+    the next call in the tick that sees the answer. ``added``: threads and descriptors in use with a
+    call pending in every leaf.
     """
 
     stamps: Stamps
@@ -168,6 +174,25 @@ class Ticked(ABC):
             if end > until:
                 return
             yield 0.0
+
+    def _measure_again(self, leaves: int, calls: int, seconds: float, tally: TickTally) -> Ticks:
+        tree = [self.leaf() for _ in range(leaves)]
+        for leaf in tree:
+            leaf.start()
+        until = _until(seconds)
+        for _ in range(calls):
+            yield PERIOD
+            begin = now()
+            for leaf in tree:
+                try:
+                    ended = leaf.look()
+                except Exception:
+                    ended = True
+                if ended:
+                    leaf.start()
+            tally.samples.append((end := now()) - begin)
+            if end > until:
+                return
 
     def _measure_state(self, leaves: int, calls: int, seconds: float, tally: TickTally) -> Ticks:
         (leaf,) = yield from self._all_pending(1)

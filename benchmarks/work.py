@@ -40,7 +40,8 @@ class Work:
         depth: history depth of clients and servers; None for what each has by default.
         server: ``stock``, an rclpy service on a SingleThreadedExecutor; ``lean``, a bare loop that
             is not the bottleneck; ``inside``, in the contestant's own process, made by itself;
-            ``stock-async``, stock with an async handler; and those of `benchmarks.servers`.
+            ``stock-async``, stock with an async handler; ``stopped``, stock, and stopped as its
+            first request comes; and those of `benchmarks.servers`.
         busy: seconds at a time for which the contestant's thread looks at no responses.
         srv_name: what all services of this work begin with; the runner gives each turn its own.
     """
