@@ -96,7 +96,7 @@ class TestCall:
     async def test_the_deadline_holds(self, session: Session, held: ServerProcess) -> None:
         await session.wait_for_service(ECHO, NAME)
         with pytest.raises(ResponseTimeout, match=NAME):
-            await in_thread(session.from_thread.call, ECHO, NAME, timeout=2 * TICK)
+            await in_thread(session.from_thread.call, ECHO, NAME, timeout=4 * TICK)
         with pytest.raises(ServiceUnavailable, match="/absent"):
             await in_thread(session.from_thread.call, ECHO, "/absent", timeout=2 * TICK)
         with pytest.raises(ServiceUnavailable):

@@ -129,7 +129,7 @@ async def test_a_bound_client(session: Session, server: ServerProcess) -> None:
 
 async def test_the_sessions_timeout_is_the_default(bridge: Bridge, server: ServerProcess) -> None:
     await server.serve("/echo", delay="never")
-    async with Session("brief", bridge=bridge, timeout=2 * TICK) as session:
+    async with Session("brief", bridge=bridge, timeout=4 * TICK) as session:
         await session.wait_for_service(ECHO, "/echo", timeout=LIMIT)
         # Its own deadline is later, and none at all.
         patient = [session.start(ECHO, "/echo", timeout=seconds) for seconds in (4 * LIMIT, None)]
