@@ -3,35 +3,16 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import Any
 
 import pytest
-from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 
 from rosasync import Session, UsageError
-from tests.support.checks import assert_clean, check_call
+from tests.support.checks import assert_clean, check_call, count_takes
 from tests.support.servers import ServerProcess
 from tests.support.times import LIMIT, TICK
 
 MOST_LOOKS = 20
 """How often a client may look for a response without polling; polling takes hundreds of looks."""
-
-
-@contextmanager
-def counted_looks() -> Iterator[list[object]]:
-    """Collect an entry for each time that any client looks for a response."""
-    looks: list[object] = []
-    take_response = _rclpy.Client.take_response
-
-    def counted(client: Any, response_type: Any) -> Any:
-        looks.append(client)
-        return take_response(client, response_type)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(_rclpy.Client, "take_response", counted)
-        yield looks
 
 
 @pytest.mark.parametrize("calls", [100, pytest.param(500, marks=pytest.mark.soak)])
@@ -67,26 +48,26 @@ async def test_other_tasks_have_their_turns(server: ServerProcess) -> None:
 
 async def test_a_slow_service_is_not_spun_for(server: ServerProcess) -> None:
     await server.serve("/echo", delay=2 * TICK)
-    with counted_looks() as looks:
+    with count_takes() as takes:
         async with Session("busy", bridge="direct", busy_poll=TICK) as session:
             await check_call(session, "/echo", "first", timeout=LIMIT)
-            looks.clear()
+            takes.looks = 0
             for number in range(5):
                 await check_call(session, "/echo", str(number), timeout=LIMIT)
-            assert 5 <= len(looks) <= 5 * MOST_LOOKS
+            assert 5 <= takes.looks <= 5 * MOST_LOOKS
 
 
 async def test_after_a_slow_answer_it_sleeps_until_a_quick_one(server: ServerProcess) -> None:
     await server.serve("/echo")
-    with counted_looks() as looks:
+    with count_takes() as takes:
         async with Session("busy", bridge="direct", busy_poll=TICK) as session:
             await check_call(session, "/echo", "first", timeout=LIMIT)
             await check_call(session, "/echo", "quick", timeout=LIMIT)
             await server.change("/echo", 2 * TICK)
             await check_call(session, "/echo", "slow, spun for", timeout=LIMIT)
-            looks.clear()
+            takes.looks = 0
             await check_call(session, "/echo", "slow, slept for", timeout=LIMIT)
-            assert 1 <= len(looks) <= MOST_LOOKS
+            assert 1 <= takes.looks <= MOST_LOOKS
             await server.change("/echo", None)
             await check_call(session, "/echo", "quick again", timeout=LIMIT)
 

@@ -120,11 +120,11 @@ class TestFairness:
             width = limits.clients
             first = [session.start(ECHO, "/echo", request_of(f"out {n}")) for n in range(width)]
             await server.received("/echo", width)
-            line = [session.start(ECHO, "/echo", request_of(str(n))) for n in range(40)]
+            queued = [session.start(ECHO, "/echo", request_of(str(n))) for n in range(40)]
             await until(lambda: session.pool.statistics().waiting == 40)
-            for task in line[1::3]:
+            for task in queued[1::3]:
                 task.cancel()
-            await asyncio.wait(line[1::3])
+            await asyncio.wait(queued[1::3])
             kept = [n for n in range(40) if n % 3 != 1]
             for count in range(len(kept)):
                 await server.release("/echo", 1)
@@ -132,11 +132,11 @@ class TestFairness:
             await server.release("/echo")
             expected = [f"out {n}" for n in range(width)] + [str(n) for n in kept]
             assert (await server.received("/echo"))[width:] == expected[width:]
-            assert [answer_to(await line[n]) for n in kept] == [str(n) for n in kept]
+            assert [answer_to(await queued[n]) for n in kept] == [str(n) for n in kept]
             await asyncio.wait(first)
             await assert_clean(session)
 
-    async def test_a_newcomer_does_not_overtake_the_line(
+    async def test_a_newcomer_does_not_overtake_the_queue(
         self, bridge: Bridge, server: ServerProcess
     ) -> None:
         await server.serve("/echo", delay="hold")
@@ -158,7 +158,7 @@ class TestFairness:
             await asyncio.gather(second, *newcomers)
 
 
-async def test_a_full_line(bridge: Bridge, server: ServerProcess) -> None:
+async def test_a_full_queue(bridge: Bridge, server: ServerProcess) -> None:
     await server.serve("/echo", delay="hold")
     limits = Limits(in_flight=1, waiting=2)
     async with Session("full", bridge=bridge, limits=limits, timeout=LIMIT) as session:

@@ -226,7 +226,7 @@ class TestSubmit:
 
 
 class TestMisuse:
-    """What raises at once, in the calling thread, before anything is sent."""
+    """Mistakes that raise at once, in the calling thread, before anything is sent."""
 
     @pytest.mark.parametrize("way", ["call", "submit"])
     async def test_on_the_loops_thread(self, session: Session, echo: str, way: str) -> None:

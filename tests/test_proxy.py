@@ -274,7 +274,7 @@ async def test_errors_are_those_of_the_state(state: ProxyState) -> None:
         assert stage.proxy.get_errors() == []
 
 
-async def test_a_wait_that_ends_in_vain_says_what_was_seen_instead() -> None:
+async def test_a_wait_that_times_out_says_what_was_seen_instead() -> None:
     async with staged() as stage:
         await stage.reach(WAITING, SOON)
         assert await settled(stage.proxy) is TIMEOUT
