@@ -24,6 +24,7 @@ from benchmarks.contestants.base import spinning
 from benchmarks.meter import usage
 from benchmarks.pipes import answer_lines
 from benchmarks.servers import SERVERS, async_handler, rosasync_server
+from benchmarks.stopped import stopping_server
 from benchmarks.work import Work, load_type, make_handler, make_qos, make_response
 
 LEAN_DEPTH = 1000
@@ -185,6 +186,9 @@ class Server:
         return {}
 
     def _serve(self, work: Work) -> None:
+        if work.server == "stopped":
+            self._stack.enter_context(stopping_server(work))
+            return
         if work.server in SERVERS:
             self._stack.enter_context(rosasync_server(work))
             return

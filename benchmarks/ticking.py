@@ -38,6 +38,9 @@ PERIOD = 0.001
 PENDING_TIMEOUT = 120.0
 """Seconds for which a call to a server that does not answer stays pending."""
 
+STOPPED_TIMEOUT = 0.05
+"""Seconds for a call to a server that has stopped."""
+
 BATCH = 100
 """Reads of a state for one sample: a single read takes less time than reading the clock."""
 
@@ -64,6 +67,8 @@ class Ticking(Protocol):
 
 def call_timeout(work: Work) -> float:
     """Return the timeout of a call; calls to a slow server must stay pending."""
+    if work.server == "stopped":
+        return STOPPED_TIMEOUT
     return PENDING_TIMEOUT if any(work.delays) else CALL_TIMEOUT
 
 
@@ -111,6 +116,8 @@ class Ticked(ABC):
     """The measures, each a generator that yields after each tick.
 
     - ``tick``: the duration of a tick in which every leaf checks a pending call.
+    - ``again``: the duration of a tick in which every leaf checks its call, and starts the next one
+      if it has ended.
     - ``state``: the duration of one read of a pending call's state.
     - ``decide``: from a leaf's decision until the middleware has the request.
     - ``see``: from taking the response out of the middleware until a tick sees it, without pauses
@@ -170,6 +177,25 @@ class Ticked(ABC):
             if end > until:
                 return
             yield 0.0
+
+    def _measure_again(self, leaves: int, calls: int, seconds: float, tally: TickTally) -> Ticks:
+        tree = [self.leaf() for _ in range(leaves)]
+        for leaf in tree:
+            leaf.start()
+        until = _until(seconds)
+        for _ in range(calls):
+            yield PERIOD
+            begin = now()
+            for leaf in tree:
+                try:
+                    ended = leaf.look()
+                except Exception:
+                    ended = True
+                if ended:
+                    leaf.start()
+            tally.samples.append((end := now()) - begin)
+            if end > until:
+                return
 
     def _measure_state(self, leaves: int, calls: int, seconds: float, tally: TickTally) -> Ticks:
         (leaf,) = yield from self._all_pending(1)

@@ -9,13 +9,17 @@ __all__ = ["describe_ticks", "make_ticks"]
 
 ANSWERING = Work(server="lean")
 PENDING = Work(server="lean", delays=(600.0,), depth=1000)
+STOPPED = Work(server="stopped")
 
 LEAVES = ("tick-running", "tick-py-trees", "tick-loop", "tick-threads", "tick-processes")
+AGAIN = ("tick-py-trees", "tick-loop", "tick-thread", "tick-threads")
 CALLING = ("tick-loop", "tick-thread", "tick-threads", "tick-processes")
 AT_ONCE = ("tick-loop", "tick-thread", "tick-threads")
 
 TITLES = {
     "tick": "one tick of a tree in which every leaf has a pending call",
+    "again": "one tick of a tree whose leaves call a server that has stopped, and call again after "
+    "each timeout",
     "state": "one read of the state of a pending call",
     "decide": "from a leaf's decision until the middleware has the request",
     "see": "from taking the response out of the middleware until a tick sees it, without pauses",
@@ -30,6 +34,7 @@ def make_ticks() -> list[Scenario]:
         _ticks("tick", 1, LEAVES),
         _ticks("tick", 100, LEAVES[:-1]),
         _ticks("tick", 1000, LEAVES[:-1]),
+        _scenario("tick, server stopped", "again", 10, AGAIN, calls=1000, work=STOPPED),
         _ticks("state", 1, LEAVES[2:]),
         _scenario("decision to request sent", "decide", 1, CALLING, calls=500),
         _scenario("response to tick", "see", 1, CALLING, calls=500),

@@ -40,7 +40,8 @@ class Work:
         depth: history depth of clients and servers; None for the default of each.
         server: ``stock``, an rclpy service on a SingleThreadedExecutor; ``lean``, a bare loop that
             is not the bottleneck; ``inside``, created by the contestant in its own process;
-            ``stock-async``, stock with an async handler; or one of `benchmarks.servers`.
+            ``stock-async``, stock with an async handler; ``stopped``, stock, and stopped by its
+            first request; or one of `benchmarks.servers`.
         busy: seconds at a time for which the contestant's thread handles no responses.
         srv_name: the prefix of all service names; each turn has its own.
     """

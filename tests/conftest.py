@@ -1,4 +1,4 @@
-"""What all tests share: a ROS domain of this run alone, stock servers, both bridges."""
+"""What all tests share: a ROS domain for this run alone, stock servers, both bridges."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from rosasync import Session
 from rosasync.ros.domain import isolate
 from tests.support.clients import ClientProcess
 from tests.support.servers import ServerProcess
-from tests.support.times import TICK
+from tests.support.times import LIMIT
 
 isolate()
 
-# A shell that starts this in the background has it ignored, and the children would inherit that.
+# A shell that starts this in the background ignores SIGINT, and child processes inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 with warnings.catch_warnings():
-    # Of rclpy's own dependencies lark still imports sre_parse, which is deprecated.
+    # lark, one of rclpy's dependencies, still imports sre_parse, which is deprecated.
     warnings.simplefilter("ignore", DeprecationWarning)
     importlib.import_module("rosidl_generator_py")
 
@@ -36,7 +36,7 @@ Bridge = Literal["direct", "executor"]
 def pytest_asyncio_loop_factories(
     item: pytest.Item,
 ) -> Mapping[str, Callable[[], asyncio.AbstractEventLoop]]:
-    """Run on asyncio's own loop, and on uvloop too where the mark ``asyncio`` names it."""
+    """Run on asyncio's own loop, and on uvloop too if the mark ``asyncio`` names it."""
     marker = item.get_closest_marker("asyncio")
     if marker is not None and "loop_factories" in marker.kwargs:
         return {"asyncio": asyncio.new_event_loop, "uvloop": uvloop.new_event_loop}
@@ -45,12 +45,12 @@ def pytest_asyncio_loop_factories(
 
 @pytest.fixture(autouse=True)
 def nothing_left_behind(caplog: pytest.LogCaptureFixture) -> Iterator[None]:
-    """No test leaves a thread behind, or an exception that only asyncio's logger heard of."""
+    """Fail a test that leaves a thread behind, or an exception that asyncio only logged."""
     before = set(threading.enumerate())
     yield
-    # asyncio's own, that wait for a child, end a moment after it.
+    # The threads in which asyncio waits for a child process end a moment after the process.
     for thread in set(threading.enumerate()) - before:
-        thread.join(10 * TICK)
+        thread.join(LIMIT)
     assert set(threading.enumerate()) <= before
     records = [*caplog.get_records("setup"), *caplog.get_records("call")]
     errors = [r for r in records if r.name == "asyncio" and r.levelno >= logging.ERROR]
@@ -67,13 +67,13 @@ def bridge(request: pytest.FixtureRequest) -> Bridge:
 @pytest.fixture
 async def session(bridge: Bridge) -> AsyncIterator[Session]:
     """An open session, on each bridge."""
-    async with Session("test_client", bridge=bridge) as session:
+    async with Session("test_client", bridge=bridge, timeout=2 * LIMIT) as session:
         yield session
     assert session.closed
 
 
 class _Processes:
-    """The processes kept for the whole run: starting one takes longer than most tests."""
+    """The processes that are kept for the whole run: starting one takes longer than most tests."""
 
     def __init__(self) -> None:
         self._server: ServerProcess | None = None

@@ -1,4 +1,4 @@
-"""The py_trees behaviours: outcomes, blackboard, halts, and trees on real servers."""
+"""The py_trees behaviours: outcomes, blackboard, halts, and trees with real servers."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def blank_blackboard() -> Iterator[None]:
 
 @pytest.fixture
 async def graph() -> FakeGraph:
-    """A graph with a server that echoes."""
+    """A graph in memory with a server that echoes."""
     graph = FakeGraph()
     graph.serve(ECHO, NAME, lambda request: f"to {request.load_namespace}")
     return graph
@@ -75,7 +75,7 @@ def ready(behaviour: Behaviour, session: Session) -> Behaviour:
 
 
 async def ticked(behaviour: Behaviour) -> Status:
-    """Tick until the run ends; the loop turns between ticks."""
+    """Tick until the run ends, with turns of the loop between the ticks."""
 
     def ended() -> bool:
         behaviour.tick_once()
@@ -86,7 +86,7 @@ async def ticked(behaviour: Behaviour) -> Status:
 
 
 class TestOutcomes:
-    """What a run ends with, and where response, error and feedback go."""
+    """How a run ends, and where its response, error and feedback go."""
 
     async def test_an_answer_is_success(self, fake_session: Session) -> None:
         answers: list[Any] = []
@@ -304,7 +304,7 @@ class TestBlackboard:
 
 
 class TestHalting:
-    """An interrupted leaf cancels its call, and its next run sees nothing of it."""
+    """An interrupted leaf cancels its call, and its next run does not see the response."""
 
     async def test_it_cancels_the_call(self, graph: FakeGraph, fake_session: Session) -> None:
         leaf = ready(CallService("leaf", ECHO, NAME), fake_session)
@@ -358,12 +358,12 @@ class TestHalting:
 
 
 class TestSetup:
-    """Setup never blocks, and finds what is wrong before the first tick."""
+    """Setup never blocks, and rejects wrong arguments before the first tick."""
 
     async def test_it_does_not_wait_for_a_server(self, fake_session: Session) -> None:
         for leaf in (CallService("a", ECHO, "/absent"), WaitForService("b", ECHO, "/absent")):
             with ThreadPoolExecutor() as threads:
-                # The loop stands still: setup cannot have waited for it.
+                # The loop stands still, so setup cannot wait for it.
                 threads.submit(ready, leaf, fake_session).result(LIMIT)
             assert isinstance(leaf.proxy, AsyncServiceProxy)
 
@@ -438,7 +438,7 @@ class TestSetup:
 
 
 async def run_tree(root: Behaviour, session: Session, where: Literal["loop", "thread"]) -> Status:
-    """Tick a tree to the end of a run, in the loop or in a thread of its own."""
+    """Tick a tree until its run ends, in the loop or in a thread."""
     tree = BehaviourTree(root)
     tree.setup(session=session)
     if where == "loop":
@@ -466,11 +466,11 @@ async def run_tree(root: Behaviour, session: Session, where: Literal["loop", "th
 
 @pytest.mark.parametrize("where", ["loop", "thread"])
 class TestTrees:
-    """Trees on a real server, ticked in the loop and in a thread."""
+    """Trees with a real server, ticked in the loop and in a thread."""
 
     @pytest.fixture
     async def robot(self, server: ServerProcess) -> ServerProcess:
-        """Services that answer at once, after a tick, and never."""
+        """Services that answer at once, after ``TICK``, and never."""
         await server.serve("/quick")
         await server.serve("/slow", delay=TICK)
         await server.serve("/never", delay="never")
@@ -575,7 +575,7 @@ class TestTrees:
         await server.serve("/deaf", skip=2)
         await session.wait_for_service(ECHO, "/deaf")
         answers: list[str] = []
-        root = Retry("retry", self.call("/deaf", answers, timeout=2 * TICK), num_failures=5)
+        root = Retry("retry", self.call("/deaf", answers, timeout=6 * TICK), num_failures=5)
         assert await run_tree(root, session, where) is Status.SUCCESS
         assert answers == ["/deaf"]
         assert await server.received("/deaf") == 3 * ["/deaf"]

@@ -1,4 +1,4 @@
-"""What the benchmarks make of their measurements: ratios, verdicts, tables, the report."""
+"""The benchmarks' ratios, verdicts, tables and report, from given measurements."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SETTINGS = {"rounds": 2, "quick": True, "pin": False}
 
 
 def results_of(scenario: Scenario, times: dict[str, list[int]], **options: Any) -> Results:
-    """Results of one scenario; the samples in µs of each contestant, the same in two rounds."""
+    """Return results of one scenario: each contestant's samples in µs, the same in two rounds."""
     results = Results({**MACHINE, "versions": {"rclpy": "7"}}, SETTINGS)
     results.scenarios[scenario.key] = scenario.to_json()
     for contestant, samples in times.items():

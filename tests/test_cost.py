@@ -1,9 +1,8 @@
 """What one call costs, counted and not timed: Python function calls, and objects left behind.
 
 The bounds are a little above what was counted when they were set. A count above its bound means
-that every call now does more than it did: take it away again, or, where it is worth its price,
-raise the bound in the same change that makes it necessary. ``benchmarks profile`` says what that
-price is in time.
+that every call now does more than it did. Remove what was added, or raise the bound in the same
+change if it is worth its price; ``benchmarks profile`` measures that in time.
 """
 
 from __future__ import annotations
@@ -52,11 +51,12 @@ class Cost:
     """What one call costs.
 
     Attributes:
-        functions: of the library that are entered; a coroutine once more when it is resumed.
-        c_functions: of C that those call.
-        peak: most bytes in use meanwhile, above those before the call, says tracemalloc.
-        left: bytes that stay in use, in the batch of calls after which the least did: timers that
-            were cancelled are cleared away now and then.
+        functions: how often functions of the library are entered; a coroutine that is resumed
+            counts again.
+        c_functions: how many C functions those call.
+        peak: the most bytes in use during the call, above those before it, by tracemalloc.
+        left: bytes that stay in use after the call. The lowest of several batches counts, because
+            asyncio removes cancelled timers only now and then.
         cycles: objects that only the garbage collector frees.
     """
 
@@ -71,25 +71,26 @@ class Cost:
 
 
 FAKE = Cost(functions=16, c_functions=12, peak=2000, left=100, cycles=0)
-"""On the fake graph, whose own lists of what was sent grow with every call."""
+"""On the fake graph, which keeps a list of everything sent."""
 BOUNDS = {
     "direct": Cost(functions=19, c_functions=16, peak=1700, left=50, cycles=0),
     "executor": Cost(functions=18, c_functions=14, peak=6300, left=50, cycles=0),
 }
-"""rclpy's part is in the bytes, not in the functions."""
+"""The bytes include rclpy's own, the functions do not."""
 
 
 async def cost_of(call: Call, calls: int = 1) -> Cost:
-    """Measure calls one after the other, or several ``calls`` at once; medians for each."""
-    for _ in range(WARM_UP):
+    """Measure a call, or ``calls`` of them at once; return the medians for one."""
+    warm_up, rounds = WARM_UP // calls, CALLS // calls
+    for _ in range(warm_up):
         await call()
-    functions, c_functions = await _count_functions(call)
-    peak, left, cycles = await _count_memory(call)
+    functions, c_functions = await _count_functions(call, rounds)
+    peak, left, cycles = await _count_memory(call, warm_up, rounds)
     counts = (functions, c_functions, peak, left, cycles)
     return Cost(*(count / calls for count in counts))
 
 
-async def _count_functions(call: Call) -> tuple[float, float]:
+async def _count_functions(call: Call, rounds: int) -> tuple[float, float]:
     entered, c_entered = [], []
     counts: Counter[str] = Counter()
 
@@ -100,7 +101,7 @@ async def _count_functions(call: Call) -> tuple[float, float]:
 
     sys.setprofile(on_event)
     try:
-        for _ in range(CALLS):
+        for _ in range(rounds):
             counts.clear()
             await call()
             entered.append(counts["call"])
@@ -110,18 +111,18 @@ async def _count_functions(call: Call) -> tuple[float, float]:
     return statistics.median(entered), statistics.median(c_entered)
 
 
-async def _count_memory(call: Call) -> tuple[float, float, float]:
-    peaks = array("q", bytes(8 * CALLS))
+async def _count_memory(call: Call, warm_up: int, rounds: int) -> tuple[float, float, float]:
+    peaks = array("q", bytes(8 * rounds))
     left = []
     gc.collect()
     gc.disable()
     tracemalloc.start()
     try:
-        for _ in range(WARM_UP):
+        for _ in range(warm_up):
             await call()
         for _ in range(BATCHES):
             start = tracemalloc.get_traced_memory()[0]
-            for number in range(CALLS):
+            for number in range(rounds):
                 tracemalloc.reset_peak()
                 before = tracemalloc.get_traced_memory()[0]
                 await call()
@@ -131,7 +132,7 @@ async def _count_memory(call: Call) -> tuple[float, float, float]:
     finally:
         tracemalloc.stop()
         gc.enable()
-    return statistics.median(peaks), min(left) / CALLS, cycles // (BATCHES * CALLS)
+    return statistics.median(peaks), min(left) / rounds, cycles // (BATCHES * rounds)
 
 
 async def test_a_call_on_the_fake_graph(fake_graph: FakeGraph) -> None:
@@ -159,7 +160,7 @@ async def test_one_of_ten_calls_at_once(session: Session, echo: str) -> None:
     async def ten() -> None:
         await asyncio.gather(*(client.call(request) for _ in range(AT_ONCE)))
 
-    # Now and then the loop looks for a response that it has taken with another one already.
+    # Sometimes the loop looks for a response that it has already taken with another one.
     bound = BOUNDS[session.bridge]
     assert await cost_of(ten, AT_ONCE) <= replace(bound, functions=bound.functions + 1)
 

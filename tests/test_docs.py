@@ -1,4 +1,4 @@
-"""The programs that the documentation shows, run as they stand against the lamp it shows."""
+"""The programs of the documentation, run unchanged against its lamp."""
 
 from __future__ import annotations
 
@@ -31,7 +31,9 @@ def lamp() -> Iterator[None]:
 
 def output_of(example: str) -> str:
     command = (sys.executable, str(EXAMPLES / f"{example}.py"))
-    return subprocess.run(command, stdout=subprocess.PIPE, text=True, timeout=60, check=True).stdout
+    return subprocess.run(
+        command, stdout=subprocess.PIPE, text=True, timeout=120, check=True
+    ).stdout
 
 
 @pytest.mark.usefixtures("lamp")

@@ -1,4 +1,4 @@
-"""The examples of trees, run as they stand against the robot they are about."""
+"""The examples of behaviour trees, run unchanged against their robot."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def robot() -> Iterator[None]:
 @pytest.mark.parametrize("tree", TREES)
 def test_tree(tree: str) -> None:
     command = (sys.executable, "-W", "error::ResourceWarning", str(ROBOT / f"{tree}.py"))
-    run = subprocess.run(command, stdout=subprocess.PIPE, text=True, timeout=60, check=True)
+    run = subprocess.run(command, stdout=subprocess.PIPE, text=True, timeout=120, check=True)
     lines = run.stdout.splitlines()
     first, at_once, last = lines[:4], lines[4:7], lines[7:]
     assert (first, sorted(at_once), last) == (FIRST, AT_ONCE, LAST)

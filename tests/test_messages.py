@@ -20,7 +20,7 @@ from builtin_interfaces.msg import Duration
 from diagnostic_msgs.msg import DiagnosticStatus
 from diagnostic_msgs.srv import AddDiagnostics, SelfTest
 from geometry_msgs.msg import Point, Point32, Pose, PoseStamped
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from nav_msgs.srv import GetPlan, SetMap
 from rcl_interfaces.msg import ParameterType, ParameterValue
@@ -45,7 +45,7 @@ shapes: Any = importlib.import_module("shape_msgs.msg")
 descriptions: Any = importlib.import_module("type_description_interfaces.msg")
 markers: Any = importlib.import_module("visualization_msgs.srv")
 
-# The parser that rosidl_generator_py imports with the first type support it loads.
+# rosidl_generator_py imports the parser, lark, with the first type support that it loads.
 pytestmark = pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning:lark")
 
 
@@ -229,7 +229,7 @@ def test_integers(value: Any) -> None:
 
 @pytest.mark.parametrize("value", [2, 2.0, np.float32(2), np.float64(2), np.int8(2)])
 def test_floats(value: Any) -> None:
-    # An int that rosidl lets through would be read as the bits of a float.
+    # rosidl accepts an int here, and serializes its bits as those of a float.
     x = to_message(Point, {"x": value}).x
     assert isinstance(x, float)
     assert wired(Point(x=x)).x == 2.0
@@ -342,7 +342,7 @@ def test_bounds_are_inclusive() -> None:
     assert to_message(Int64, {"data": -(2**63)}).data == -(2**63)
 
 
-# What is refused
+# What is rejected
 
 WRONG_KIND: list[tuple[type[Any], dict[str, Any], str]] = [
     (Bool, {"data": 1}, "data: expected bool, got int 1"),
@@ -482,11 +482,11 @@ def test_only_messages_are_made(message_type: Any) -> None:
         to_message(message_type, {})
 
 
-# What no installed package has: stand-ins shaped like generated classes
+# Field types that no installed package has: stand-ins for generated classes
 
 
 class Part:
-    """A message type that, as an action's goal, cannot be imported by its name."""
+    """A message type that cannot be imported by its name, like an action's goal."""
 
     SLOT_TYPES = (idl.BasicType("int8"),)
 
@@ -623,17 +623,17 @@ def test_to_dict_of_no_message(message: Any, error: str) -> None:
         to_dict(message)
 
 
-# Every value there and back, also through the middleware's encoding
+# Every value to a message and back, also through the middleware's encoding
 
 
 def wired(message: Any) -> Any:
-    """Return the message as a receiver gets it."""
+    """Return the message as a receiver would get it."""
     return deserialize_message(serialize_message(message), type(message))
 
 
 @contextlib.contextmanager
 def checking_setters() -> Iterator[None]:
-    """Switch on the checks of the generated setters, which must agree with ours."""
+    """Enable the checks of the generated setters, which have to agree with ours."""
     generated = [module for name, module in sys.modules.items() if is_generated(name)]
     with contextlib.ExitStack() as stack:
         for module in generated:
@@ -695,7 +695,9 @@ ROUND_TRIPS = [
 
 
 @pytest.mark.parametrize("message_type", ROUND_TRIPS, ids=type_name)
-@settings(max_examples=25, deadline=None, database=None)
+@settings(
+    max_examples=25, deadline=None, database=None, suppress_health_check=[HealthCheck.too_slow]
+)
 @given(st.data())
 def test_plain_values_survive_the_round_trip(message_type: type[Any], data: st.DataObject) -> None:
     plain: Mapping[str, Any] = data.draw(plain_values(message_type))

@@ -1,4 +1,4 @@
-"""AsyncServiceProxy: every state with every event, and the defects its forerunner had."""
+"""AsyncServiceProxy: every state with every event, and the defects of the proxy it replaces."""
 
 from __future__ import annotations
 
@@ -48,17 +48,17 @@ ERROR = ProxyState.ERROR
 NAME = "/echo"
 
 SOON = 3 * TICK
-"""The timeout of what is to run into it."""
+"""The timeout of what is to time out, in seconds."""
 
 
 async def settled(proxy: AsyncServiceProxy) -> ProxyState:
-    """Wait until the loop is not at work on it any more."""
+    """Wait until nothing is pending; return the state."""
     await until(lambda: proxy.get_state() not in (WAITING, RUNNING))
     return proxy.get_state()
 
 
 class Stage:
-    """A proxy, the graph it is in, and a server that answers when it is told to."""
+    """A proxy, its graph, and a server that answers when the test says so."""
 
     def __init__(self, graph: FakeGraph, session: Session) -> None:
         self.graph = graph
@@ -68,7 +68,7 @@ class Stage:
         self.server: FakeServer | None = None
 
     def serve(self) -> None:
-        """Have a server appear that holds back its answers."""
+        """Have a server appear that holds back its responses."""
         if self.server is None:
             self._held.enter_context(self.graph.hold_requests())
             self.server = self.graph.serve(ECHO, NAME, lambda _: "the answer")
@@ -81,17 +81,23 @@ class Stage:
     def answer(self) -> None:
         self._held.close()
 
-    async def reach(self, state: ProxyState) -> None:
-        """Bring the proxy into this state, with what it asked for last still to be answered."""
+    async def reach(self, state: ProxyState, timeout: float = LIMIT) -> None:
+        """Bring the proxy into this state, with the response to its last call still held back.
+
+        Args:
+            state: to reach.
+            timeout: seconds for the call or wait; TIMEOUT takes a short one.
+        """
         proxy = self.proxy
         if state is WAITING:
-            proxy.wait_for_service(SOON)
+            proxy.wait_for_service(timeout)
         if state is AVAILABLE:
             self.serve()
-            proxy.wait_for_service(SOON)
+            proxy.wait_for_service(timeout)
         if state in (RUNNING, READY, TIMEOUT, ABORTED, ERROR):
             self.serve()
-            proxy.call_service(timeout=math.inf if state is ERROR else SOON)
+            await self.session.wait_for_service(ECHO, NAME)
+            proxy.call_service(timeout=SOON if state is TIMEOUT else timeout)
             await until(lambda: self.session.pool.statistics().in_flight)
         if state is READY:
             self.answer()
@@ -111,7 +117,7 @@ async def staged() -> AsyncIterator[Stage]:
         yield Stage(graph, session)
 
 
-# What each method leads to, at once.
+# The state after each method, at once.
 ASKED = {
     #          call     wait     stop     read     errors   shutdown
     IDLE: (RUNNING, WAITING, IDLE, IDLE, IDLE, IDLE),
@@ -133,7 +139,7 @@ METHODS: tuple[Callable[[AsyncServiceProxy], object], ...] = (
 )
 METHOD_NAMES = ("call", "wait", "stop", "read", "errors", "shutdown")
 
-# What the news that reach the loop lead to.
+# The state after each event in the loop.
 TOLD = {
     #          answered  deadline  appeared   vanished  closed
     IDLE: (IDLE, IDLE, IDLE, IDLE, IDLE),
@@ -148,7 +154,7 @@ TOLD = {
 
 
 async def turns() -> None:
-    """Let the loop turn often enough for whatever is due to come through."""
+    """Let the loop turn often enough for everything that is due."""
     for _ in range(20):
         await asyncio.sleep(0)
 
@@ -160,6 +166,7 @@ async def answered(stage: Stage) -> None:
 
 async def deadline(stage: Stage) -> None:
     await asyncio.sleep(1.5 * SOON)
+    await turns()
 
 
 async def appeared(stage: Stage) -> None:
@@ -170,6 +177,7 @@ async def appeared(stage: Stage) -> None:
 async def vanished(stage: Stage) -> None:
     stage.vanish()
     await asyncio.sleep(0.6 * TICK)
+    await turns()
 
 
 async def closed(stage: Stage) -> None:
@@ -203,7 +211,7 @@ def at_once(method: Callable[[AsyncServiceProxy], object], proxy: AsyncServicePr
 def in_thread(
     method: Callable[[AsyncServiceProxy], object], proxy: AsyncServiceProxy
 ) -> ProxyState:
-    """In a thread, with the loop standing still until it ends."""
+    """Call a method in a thread, while the loop stands still."""
     with ThreadPoolExecutor() as threads:
         return threads.submit(at_once, method, proxy).result()
 
@@ -219,7 +227,7 @@ async def test_each_method_in_each_state(
         await stage.reach(state)
         after = (at_once if where == "loop" else in_thread)(METHODS[number], stage.proxy)
         assert after is ASKED[state][number]
-        # What is still under way goes on, and nothing of what was asked before shows up.
+        # What is still pending goes on, and nothing that was asked for before shows up.
         await answered(stage)
         stage.serve()
         await answered(stage)
@@ -235,9 +243,13 @@ async def test_each_piece_of_news_in_each_state(
     state: ProxyState, news: Callable[[Stage], Awaitable[None]]
 ) -> None:
     async with staged() as stage:
-        await stage.reach(state)
+        pending = state in (WAITING, RUNNING)
+        await stage.reach(state, SOON if pending and news is deadline else LIMIT)
         await news(stage)
-        assert stage.proxy.get_state() is TOLD[state][NEWS.index(news)]
+        expected = TOLD[state][NEWS.index(news)]
+        if expected is not state:
+            await until(lambda: stage.proxy.get_state() is not state)
+        assert stage.proxy.get_state() is expected
 
 
 @pytest.mark.parametrize("state", ProxyState)
@@ -262,9 +274,9 @@ async def test_errors_are_those_of_the_state(state: ProxyState) -> None:
         assert stage.proxy.get_errors() == []
 
 
-async def test_a_wait_that_ends_in_vain_says_what_was_seen_instead() -> None:
+async def test_a_wait_that_times_out_says_what_was_seen_instead() -> None:
     async with staged() as stage:
-        await stage.reach(WAITING)
+        await stage.reach(WAITING, SOON)
         assert await settled(stage.proxy) is TIMEOUT
         (error,) = stage.proxy.get_errors()
         assert isinstance(error, ServiceUnavailable)
@@ -420,7 +432,7 @@ async def test_nothing_is_kept_of_what_has_ended(state: ProxyState) -> None:
 
 
 class TestForerunner:
-    """What the proxy this one replaces got wrong; each test fails on the behaviour it names."""
+    """The defects of the proxy that this one replaces; each docstring names one."""
 
     @pytest.fixture
     async def held(self, server: ServerProcess) -> ServerProcess:
@@ -430,7 +442,7 @@ class TestForerunner:
     async def test_a_claimed_client_is_not_given_to_another(
         self, bridge: Bridge, held: ServerProcess
     ) -> None:
-        """The filter over claimed clients was always true, so that all calls shared the first."""
+        """The filter for claimed clients was always true, so all calls shared the first."""
         async with Session(bridge=bridge, limits=Limits(clients=8, in_flight=1)) as session:
             proxies = [AsyncServiceProxy(session, ECHO, NAME) for _ in range(2)]
             for proxy in proxies:
@@ -444,7 +456,7 @@ class TestForerunner:
     async def test_clients_made_on_demand_are_all_kept(
         self, bridge: Bridge, held: ServerProcess
     ) -> None:
-        """The counter of ids stayed 0, so that each new client took the place of the one before."""
+        """The counter of ids stayed 0, so each new client replaced the one before."""
         async with Session(bridge=bridge, limits=Limits(clients=8, in_flight=1)) as session:
             proxies = [AsyncServiceProxy(session, ECHO, NAME) for _ in range(5)]
             for round_ in range(2):
@@ -487,7 +499,7 @@ class TestForerunner:
         await assert_clean(session)
 
     async def test_an_interrupted_wait_does_not_stay_in_its_state(self, session: Session) -> None:
-        """An interrupt that neither ended nor reported the wait left it RUNNING for ever."""
+        """An interrupt neither ended nor reported the wait, and left it RUNNING for ever."""
         proxy = AsyncServiceProxy(session, ECHO, "/absent")
         proxy.wait_for_service()
         await asyncio.sleep(0)
@@ -498,7 +510,7 @@ class TestForerunner:
         await assert_clean(session)
 
     async def test_proxies_of_one_service_share_a_client(self, session: Session, echo: str) -> None:
-        """The version for ROS 2 has no pool: a client for each."""
+        """The version for ROS 2 had no pool, but a client for each proxy."""
         proxies = [AsyncServiceProxy(session, ECHO, echo) for _ in range(50)]
         for number, proxy in enumerate(proxies):
             proxy.call_service(request_of(str(number)))
@@ -510,7 +522,7 @@ class TestForerunner:
     async def test_stopping_does_not_claim_to_have_aborted_what_had_ended(
         self, session: Session, echo: str
     ) -> None:
-        """stop_call said ABORTED over IDLE and over an outcome, once a thread had been started."""
+        """After a first call, stop_call replaced IDLE and each outcome by ABORTED."""
         proxy = AsyncServiceProxy(session, ECHO, echo)
         proxy.call_service(request_of("a"))
         assert await settled(proxy) is READY
@@ -523,11 +535,11 @@ class TestForerunner:
         assert proxy.get_state() is AVAILABLE
 
     async def test_an_error_after_an_abort_stays_aborted(self, session: Session) -> None:
-        """The aborted thread's error was written over ABORTED."""
+        """The error of the aborted thread replaced ABORTED."""
         proxy = AsyncServiceProxy(session, ECHO, "/absent")
         proxy.call_service(timeout=TICK)
         with ThreadPoolExecutor() as threads:
-            # The loop stands still meanwhile, and finds both the deadline and the abort.
+            # The loop stands still meanwhile, and then finds both the deadline and the abort.
             threads.submit(time.sleep, 2 * TICK).result()
         proxy.stop_call()
         await asyncio.sleep(TICK)
@@ -539,7 +551,7 @@ class TestForerunner:
     async def test_shutdown_ends_a_call_that_is_out(
         self, session: Session, held: ServerProcess
     ) -> None:
-        """shutdown unclaimed the client its thread was still using, for others to claim."""
+        """shutdown released the client that its thread was still using, for others to claim."""
         proxy, other = (AsyncServiceProxy(session, ECHO, NAME) for _ in range(2))
         proxy.call_service(request_of("a"))
         await held.received(NAME, 1)
@@ -571,7 +583,7 @@ async def test_a_server_that_appears_gets_the_call_that_waits(
 
 @pytest.mark.asyncio(loop_factories=["asyncio", "uvloop"])
 async def test_two_threads_and_the_loop_may_use_one_proxy(session: Session, echo: str) -> None:
-    """Whatever the order, it ends in a call whose answer it shows, and nothing is left behind."""
+    """In any order, the last call gets its own response, and nothing is left behind."""
     proxy = AsyncServiceProxy(session, ECHO, echo)
 
     def quarrel() -> None:

@@ -1,4 +1,4 @@
-"""What ``docs/explanation/seeds.md`` names as shown by a test is a test."""
+"""Each test that ``docs/explanation/seeds.md`` names exists."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A session and its calls, against stock servers in another process."""
+"""A session and its calls to stock servers in another process."""
 
 from __future__ import annotations
 
@@ -33,25 +33,27 @@ if TYPE_CHECKING:
     from tests.support.servers import ServerProcess
 
 
-async def test_a_thousand_calls_one_at_a_time(session: Session, echo: str) -> None:
-    for number in range(1000):
+@pytest.mark.parametrize("calls", [300, pytest.param(1000, marks=pytest.mark.soak)])
+async def test_many_calls_one_at_a_time(session: Session, echo: str, calls: int) -> None:
+    for number in range(calls):
         await check_call(session, echo, str(number))
     statistics = session.pool.statistics()
-    assert statistics.completed == 1000
+    assert statistics.completed == calls
     assert statistics.created == statistics.clients == statistics.peak == 1
     await assert_clean(session)
 
 
-async def test_five_thousand_calls_from_200_callers(session: Session, echo: str) -> None:
+@pytest.mark.parametrize("calls", [7, pytest.param(25, marks=pytest.mark.soak)])
+async def test_calls_from_200_callers(session: Session, echo: str, calls: int) -> None:
     async def caller(name: int) -> None:
-        for number in range(25):
-            await check_call(session, echo, f"{name}-{number}", timeout=3 * LIMIT)
+        for number in range(calls):
+            await check_call(session, echo, f"{name}-{number}", timeout=4 * LIMIT)
 
     async with asyncio.TaskGroup() as group:
         for name in range(200):
             group.create_task(caller(name))
     statistics = session.pool.statistics()
-    assert statistics.completed == 5000
+    assert statistics.completed == 200 * calls
     assert statistics.clients == 1
     assert statistics.peak == 10
     assert statistics.late == statistics.timed_out == statistics.cancelled == 0
@@ -127,16 +129,18 @@ async def test_a_bound_client(session: Session, server: ServerProcess) -> None:
 
 async def test_the_sessions_timeout_is_the_default(bridge: Bridge, server: ServerProcess) -> None:
     await server.serve("/echo", delay="never")
-    async with Session("brief", bridge=bridge, timeout=2 * TICK) as session:
+    async with Session("brief", bridge=bridge, timeout=4 * TICK) as session:
         await session.wait_for_service(ECHO, "/echo", timeout=LIMIT)
-        with pytest.raises(ResponseTimeout) as caught:
+        # Its own deadline is later, and none at all.
+        patient = [session.start(ECHO, "/echo", timeout=seconds) for seconds in (4 * LIMIT, None)]
+        with pytest.raises(ResponseTimeout):
             await session.call(ECHO, "/echo")
-        assert 2 * TICK <= caught.value.elapsed < LIMIT
         with pytest.raises(ResponseTimeout):
             await session.client(ECHO, "/echo").call()
-        with pytest.raises(TimeoutError):
-            async with asyncio.timeout(4 * TICK):
-                await session.call(ECHO, "/echo", timeout=None)
+        assert not any(task.done() for task in patient)
+    for task in patient:
+        with pytest.raises(SessionClosed):
+            await task
 
 
 async def test_what_a_session_tells_of_itself(bridge: Bridge, echo: str) -> None:
@@ -256,19 +260,16 @@ async def test_ready_or_not(session: Session, server: ServerProcess) -> None:
 
 
 class TestRetry:
-    """Sending again what is unanswered."""
+    """Sending a request again if it is unanswered."""
 
     async def test_first_answer_wins_and_the_second_is_late(
         self, session: Session, server: ServerProcess
     ) -> None:
         await server.serve("/echo", delay="hold")
-        retry = Retry(attempts=2, after=4 * TICK)
+        retry = Retry(attempts=2, after=2 * TICK)
         await session.wait_for_service(ECHO, "/echo", timeout=LIMIT)
-        loop = asyncio.get_running_loop()
-        began = loop.time()
         call = session.start(ECHO, "/echo", request_of("twice"), retry=retry, timeout=LIMIT)
         assert await server.received("/echo", 2) == ["twice", "twice"]
-        assert loop.time() - began >= 4 * TICK
         await server.release("/echo", 1, newest=True)
         assert answer_to(await call) == "twice"
         await server.release("/echo", 1)
@@ -278,6 +279,22 @@ class TestRetry:
         statistics = session.pool.statistics()
         assert statistics.completed == 1
         assert statistics.retried == 1
+
+    async def test_nothing_is_sent_again_before_its_time(
+        self, session: Session, server: ServerProcess
+    ) -> None:
+        await server.serve("/echo", delay="hold")
+        retry = Retry(attempts=2, after=4 * LIMIT)
+        call = session.start(ECHO, "/echo", request_of("once"), retry=retry)
+        await server.received("/echo", 1)
+        for number in range(2):
+            later = session.start(ECHO, "/echo", request_of(str(number)))
+            await server.received("/echo", 2 + number)
+            await server.release("/echo", 1, newest=True)
+            await later
+        await server.release("/echo")
+        assert answer_to(await call) == "once"
+        assert await server.received("/echo") == ["once", "0", "1"]
 
     async def test_an_answer_to_the_first_attempt_counts_too(
         self, session: Session, server: ServerProcess
@@ -297,9 +314,7 @@ class TestRetry:
     ) -> None:
         await server.serve("/echo", skip=2)
         retry = Retry(attempts=3, after=2 * TICK, backoff=2)
-        began = asyncio.get_running_loop().time()
         await check_call(session, "/echo", "third time", retry=retry)
-        assert asyncio.get_running_loop().time() - began >= 6 * TICK
         assert await server.received("/echo") == ["third time"] * 3
 
     async def test_the_deadline_is_the_whole_calls(
@@ -308,17 +323,16 @@ class TestRetry:
         await server.serve("/echo", delay="never")
         await session.wait_for_service(ECHO, "/echo", timeout=LIMIT)
         retry = Retry(attempts=100, after=TICK, backoff=1)
-        with pytest.raises(ResponseTimeout) as caught:
-            await session.call(ECHO, "/echo", retry=retry, timeout=5.5 * TICK)
-        assert 5.5 * TICK <= caught.value.elapsed < 20 * TICK
-        sent = len(await server.received("/echo", 2))
-        assert 2 <= sent <= 6
-        assert session.pool.statistics().retried == sent - 1
+        with pytest.raises(ResponseTimeout):
+            await session.call(ECHO, "/echo", retry=retry, timeout=6 * TICK)
+        retried = session.pool.statistics().retried
+        assert retried < 99
+        assert len(await server.received("/echo", 1 + retried)) == 1 + retried
 
     async def test_never_without_being_asked_for(
         self, session: Session, server: ServerProcess
     ) -> None:
-        await server.serve("/echo", delay=20 * TICK)
+        await server.serve("/echo", delay=10 * TICK)
         await check_call(session, "/echo", "once")
         assert await server.received("/echo") == ["once"]
 
@@ -330,7 +344,7 @@ class TestRetry:
         await start_flood(client_process, server, echo)
         blocking = asyncio.create_task(blocked_loop())
         try:
-            tally = await call_in_bursts(session, echo, 60, retry=retry, timeout=LIMIT)
+            tally = await call_in_bursts(session, echo, 60, retry=retry, timeout=4 * LIMIT)
         finally:
             blocking.cancel()
             flood = await client_process.result()
@@ -339,7 +353,7 @@ class TestRetry:
 
 
 class TestBadInput:
-    """What is said at once, before anything is sent."""
+    """What is rejected at once, before anything is sent."""
 
     async def test_a_message_of_the_wrong_type(self, session: Session, echo: str) -> None:
         with pytest.raises(TypeError, match=r"(?s)AddDiagnostics.*SetBool|SetBool.*AddDiagnostics"):

@@ -1,1 +1,1 @@
-"""What the tests share: servers in other processes, domains, waiting without sleeping."""
+"""What the tests share: servers in other processes, and waiting for conditions."""

@@ -1,34 +1,78 @@
-"""What a test looks at when the calls are over."""
+"""What a test checks when the calls are over."""
 
 from __future__ import annotations
 
 import asyncio
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import pytest
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
+
 from tests.support.echo import ECHO, answer_to, request_of
-from tests.support.times import until
+from tests.support.times import LIMIT, until
 
 if TYPE_CHECKING:
     from rosasync import Session
 
-__all__ = ["assert_clean", "check_call", "count_descriptors", "count_threads", "pending_in_rclpy"]
+__all__ = [
+    "Takes",
+    "assert_clean",
+    "check_call",
+    "count_descriptors",
+    "count_takes",
+    "count_threads",
+    "pending_in_rclpy",
+    "take_what_is_left",
+]
+
+
+@dataclass
+class Takes:
+    """How often clients looked for a response, and how many the middleware handed to them."""
+
+    looks: int = 0
+    responses: int = 0
+
+
+@contextmanager
+def count_takes() -> Iterator[Takes]:
+    """Count what the clients of the sessions that are opened meanwhile take.
+
+    So what the middleware has lost is told from what the library has lost.
+    """
+    takes = Takes()
+    take_response = _rclpy.Client.take_response
+
+    def counted(client: Any, response_type: Any) -> Any:
+        taken = take_response(client, response_type)
+        takes.looks += 1
+        takes.responses += taken[0] is not None
+        return taken
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(_rclpy.Client, "take_response", counted)
+        yield takes
 
 
 async def check_call(session: Session, name: str, text: str, **options: Any) -> None:
-    """Call a service of the echoing type and hold that the answer is to this very request."""
+    """Call a service of the echoing type and check that the response is to this request."""
     response = await session.call(ECHO, name, request_of(text), **options)
     assert answer_to(response) == text
 
 
 async def assert_clean(session: Session) -> None:
-    """Wait until no place in any window is taken, and hold that nothing else is left either."""
+    """Wait until no request is outstanding, and check that nothing else is left either."""
 
     def settled() -> bool:
         now = session.pool.statistics()
         return now.in_flight == now.waiting == now.abandoned == 0
 
-    await until(settled)
+    # A place that waits for a response the middleware has lost comes back after Limits.grace.
+    await until(settled, 2 * LIMIT)
     now = session.pool.statistics()
     assert now.idle == now.clients
     assert pending_in_rclpy(session) == 0
@@ -37,15 +81,25 @@ async def assert_clean(session: Session) -> None:
 
 
 def pending_in_rclpy(session: Session) -> int:
-    """How many requests rclpy itself still keeps an entry for."""
+    """Return how many requests rclpy itself still keeps an entry for."""
     return sum(len(client._pending_requests) for client in session.node.clients)
 
 
+def take_what_is_left(session: Session) -> int:
+    """Take the responses that the clients have not taken; return how many there were."""
+    found = 0
+    for client in session.node.clients:
+        # One take that gives nothing does not mean that nothing is left.
+        for _ in range(100):
+            found += client.handle.take_response(client.srv_type.Response)[0] is not None
+    return found
+
+
 def count_descriptors() -> int:
-    """How many files this process has open."""
+    """Return how many files this process has open."""
     return len(os.listdir("/proc/self/fd"))
 
 
 def count_threads() -> int:
-    """How many threads this process has, the middleware's too."""
+    """Return how many threads this process has, including the middleware's."""
     return len(os.listdir("/proc/self/task"))

@@ -1,7 +1,7 @@
 """A process of stock rclpy clients: ``python -m tests.support.clients``.
 
-It calls services of the echoing type with ``client.call_async`` or, in threads, ``client.call``,
-and tells how many answers came, came wrong, or never came.
+It calls services of the echoing type with ``client.call_async`` or, in threads, ``client.call``.
+It reports how many responses came, were wrong, or never came.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ __all__ = ["ClientProcess", "Tally"]
 
 @dataclass
 class Tally:
-    """What became of the calls of one run."""
+    """How the calls of one run ended."""
 
     answered: int = 0
     wrong: int = 0
@@ -35,7 +35,7 @@ class Tally:
         return self.answered + self.wrong + self.lost
 
     def count(self, text: str, response: Any) -> None:
-        """Count one call that sent ``text``; a response of None is one that never came."""
+        """Count one call that sent ``text``; the response is None if none came."""
         if response is None:
             self.lost += 1
         elif answer_to(response) == text:
@@ -62,18 +62,18 @@ class ClientProcess(Child):
         timeout: float = LIMIT / 4,
         tag: str = "",
     ) -> None:
-        """Begin a run; it goes on in the child while the test does something else.
+        """Begin a run, which goes on in the child while the test does something else.
 
         Args:
-            name: of the service.
-            calls: how many each client makes; None to go on until :meth:`result` is asked for.
-            way: of calling. ``call`` takes a thread for each request in flight.
-            in_flight: how many requests each client has out at once.
+            name: the service's name.
+            calls: how many calls each client makes; None to go on until `result` is called.
+            way: how to call. ``call`` takes a thread for each request in flight.
+            in_flight: how many requests each client has outstanding at once.
             clients: how many rclpy clients, all on one node.
-            depth: of their history; the default of ROS, 10, where it is left out.
-            block: the process is busy for so many seconds between looks at its responses.
-            timeout: seconds after which a call without an answer counts as lost.
-            tag: begins the text of every request, to tell processes apart.
+            depth: the depth of their history; None for the default of ROS, 10.
+            block: seconds for which the process is busy before it takes its next responses.
+            timeout: seconds after which a call without a response counts as lost.
+            tag: the beginning of the text of every request, to tell processes apart.
         """
         await self.ask(
             "start",
@@ -89,11 +89,11 @@ class ClientProcess(Child):
         )
 
     async def result(self) -> Tally:
-        """Wait for the end of the run, ending one that would go on for ever."""
+        """End the run if it has no end of its own, and wait for the result."""
         return Tally(**await self.ask("result"))
 
     async def run(self, name: str, calls: int, **options: Any) -> Tally:
-        """Make calls and wait for the end of them; the options are those of :meth:`start`."""
+        """Make calls and wait until they have ended; the options are those of `start`."""
         await self.start(name, calls, **options)
         return await self.result()
 
@@ -114,7 +114,7 @@ class _Run:
 
 
 class _Runner:
-    """The child's side: runs one after the other in the main thread."""
+    """The child's side: one run after the other, in the main thread."""
 
     def __init__(self, node: Any) -> None:
         self._runs: queue.SimpleQueue[_Run | None] = queue.SimpleQueue()
@@ -122,7 +122,7 @@ class _Runner:
         self._node = node
 
     def start(self, **options: Any) -> None:
-        """Begin a run; one that a failed test left behind is ended and forgotten."""
+        """Begin a run, after ending one that a failed test left behind."""
         self._end_last()
         self._last = _Run(**options)
         self._runs.put(self._last)
@@ -136,7 +136,7 @@ class _Runner:
         return asdict(result)
 
     def stop(self) -> None:
-        """End the work, and an endless run that is under way."""
+        """End the work, and the current run."""
         self._end_last()
         self._runs.put(None)
 
@@ -168,7 +168,7 @@ class _Runner:
                 self._node.destroy_client(client)
 
     def _texts(self, run: _Run, index: int) -> Callable[[], str | None]:
-        """The texts of one client's requests, then None."""
+        """Return a function that returns the text of each request of a client, then None."""
         count = 0
 
         def next_text() -> str | None:
@@ -243,7 +243,7 @@ class _Runner:
 
 
 def _spin(executor: Any, block: float) -> None:
-    """Run one callback; or, where the process is to be busy, block first and then run several."""
+    """Run one callback. If the process is to be busy, block first and then run several."""
     if not block:
         executor.spin_once(TICK)
         return
@@ -254,7 +254,7 @@ def _spin(executor: Any, block: float) -> None:
 
 
 def _settle(client: Any, pending: dict[Any, tuple[str, float]], tally: Tally) -> None:
-    """Count what is answered or lost, and forget it."""
+    """Count the calls that have been answered or lost, and remove them."""
     now = time.monotonic()
     for future, (text, deadline) in list(pending.items()):
         if future.done():

@@ -1,4 +1,4 @@
-"""What the stock servers answer, and what a client checks: each answer carries its request."""
+"""The requests of the tests and their responses, which tell what request they answer."""
 
 from __future__ import annotations
 
@@ -9,27 +9,27 @@ from typing import Any
 __all__ = ["ECHO", "answer_to", "fill", "request_of", "response_to", "service_class"]
 
 ECHO = "diagnostic_msgs/srv/AddDiagnostics"
-"""The type that echoes: a string in, a string out."""
+"""A service type that can echo: a string in the request, a string in the response."""
 
 
 def service_class(name: str) -> Any:
-    """The class of a service type: ``"std_srvs/srv/SetBool"``."""
+    """Return the class of a service type, such as ``"std_srvs/srv/SetBool"``."""
     package, _, short = name.split("/")
     return getattr(importlib.import_module(f"{package}.srv"), short)
 
 
 def request_of(text: str) -> Any:
-    """A request of the type ``ECHO`` that carries ``text``."""
+    """Return a request of the type ``ECHO`` that carries ``text``."""
     return service_class(ECHO).Request(load_namespace=text)
 
 
 def answer_to(response: Any) -> str:
-    """The text that a response of the type ``ECHO`` carries."""
+    """Return the text that a response of the type ``ECHO`` carries."""
     return str(response.message)
 
 
 def response_to(request: Any) -> str:
-    """What of a request comes back in its response, for the types used here."""
+    """Return the part of a request that its response repeats, for the types used here."""
     for field in ("load_namespace", "names", "data", "map_url"):
         if hasattr(request, field):
             value = getattr(request, field)
@@ -38,7 +38,7 @@ def response_to(request: Any) -> str:
 
 
 def fill(request: Any, response: Any) -> Any:
-    """Fill a fresh response so that it tells which request it answers."""
+    """Fill a new response so that it tells which request it answers."""
     text = response_to(request)
     filler = _FILLERS.get(type(response).__name__.removesuffix("_Response"))
     if filler is not None:

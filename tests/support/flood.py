@@ -1,8 +1,8 @@
-"""What is lost when one process floods a stock server and another is slow to look at its answers.
+"""What is lost when one process floods a stock server and another is slow to take its responses.
 
-``python -m tests.support.flood`` measures it, for rosasync and beside it for rclpy's own
-``client.call_async``, and prints a table. Nothing is asserted: without ``Retry`` the middleware may
-drop requests and responses, and how many depends on the machine.
+``python -m tests.support.flood`` measures it for rosasync and for ``client.call_async``, and prints
+a table. Nothing is asserted: without ``Retry`` the middleware may drop requests and
+responses, and how many depends on the machine.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ async def blocked_loop(block: float = TICK) -> None:
 
 
 async def start_flood(client: ClientProcess, server: ServerProcess, name: str) -> None:
-    """Have a process call a service as fast as it can, eight requests at once, until its result."""
+    """Have a process call a service, eight requests at once, until its result is asked for."""
     answered = await server.answered(name)
     await client.start(name, None, in_flight=8, timeout=4 * TICK)
     await server.answered(name, answered + 100)
@@ -44,7 +44,7 @@ async def start_flood(client: ClientProcess, server: ServerProcess, name: str) -
 async def call_in_bursts(
     session: Session, name: str, calls: int, *, retry: Retry | None, timeout: float
 ) -> Tally:
-    """Call a service, ten requests at once, and count what becomes of them."""
+    """Call a service, ten requests at once, and count how the calls end."""
     tally = Tally()
 
     async def one(text: str) -> None:
@@ -64,7 +64,7 @@ async def call_in_bursts(
 
 
 async def main(calls: int) -> None:
-    """Measure each way in turn beside the same flood, and print what was lost."""
+    """Measure each way in turn beside the same flood, and print how many calls were lost."""
 
     def ours(bridge: Bridge, retry: Retry | None) -> Callable[[], Awaitable[Tally]]:
         async def run() -> Tally:

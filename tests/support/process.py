@@ -35,9 +35,9 @@ _PROFILE_VARIABLE = (
     else "FASTDDS_DEFAULT_PROFILES_FILE"
 )
 
-# New sessions come and go with every test. Announcing itself more often than every 3 s, the process
-# is found at once even by one that takes the place of another. Where a packet of the discovery was
-# lost, its usual 0.1 s would not be enough to match a client before its first response is dropped.
+# Every test opens new sessions. A process that announces itself every 0.2 s instead of every 3 s is
+# found at once, even by a session that takes the place of another. A response waits up to 3 s for
+# its client to be matched: if a discovery packet is lost, the usual 0.1 s is not enough.
 _PROFILE = """<?xml version="1.0" encoding="UTF-8" ?>
 <profiles xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
   <participant profile_name="child" is_default_profile="true"><rtps><builtin><discovery_config>
@@ -53,7 +53,7 @@ _PROFILE = """<?xml version="1.0" encoding="UTF-8" ?>
 
 @contextmanager
 def profile(lease: int = 20) -> Iterator[dict[str, str]]:
-    """Write the profile for a process that makes its context meanwhile; yields its variable."""
+    """Write the middleware's profile for a child; yield the variable that names it."""
     with TemporaryDirectory() as folder:
         file = Path(folder) / "profile.xml"
         file.write_text(_PROFILE.format(seconds=lease))
@@ -61,16 +61,16 @@ def profile(lease: int = 20) -> Iterator[dict[str, str]]:
 
 
 class ChildError(Exception):
-    """What went wrong in the child, with its traceback."""
+    """An exception in the child, with its traceback."""
 
 
 class Child:
     """A child process that runs one of the modules beside this one.
 
-    It belongs to no loop: it may be made in a fixture of the whole run and used in any test.
+    It belongs to no loop: a fixture of the whole run may make it, for any test to use.
 
     Args:
-        lease: seconds after which the others notice that it was killed, as in the middleware.
+        lease: seconds after which other processes notice that this one was killed.
     """
 
     module: str
@@ -102,7 +102,7 @@ class Child:
         return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
     def ask_now(self, command: str, **arguments: Any) -> Any:
-        """Send a command and block until it is answered, which the child sees to in time."""
+        """Send a command and block until the child has answered it."""
         stdin, stdout = self._pipes()
         with self._lock:
             stdin.write(json.dumps({"do": command, "with": arguments}).encode() + b"\n")
@@ -117,7 +117,7 @@ class Child:
         return answer["value"]
 
     async def ask(self, command: str, **arguments: Any) -> Any:
-        """The same without blocking the loop."""
+        """Send a command and wait for the answer without blocking the loop."""
         return await asyncio.to_thread(self.ask_now, command, **arguments)
 
     def kill(self) -> None:
@@ -129,11 +129,11 @@ class Child:
             file.unlink(missing_ok=True)
 
     def close(self) -> None:
-        """End it in an orderly way; killed if it does not."""
+        """Ask it to end by closing its stdin, and wait for that; kill it if it does not end."""
         with suppress(BrokenPipeError):
             self._pipes()[0].close()
         try:
-            self._process.wait(LIMIT / 4)
+            self._process.wait(LIMIT)
         except subprocess.TimeoutExpired:
             self.kill()
             raise
@@ -180,8 +180,8 @@ def serve_commands(commands: Mapping[str, Callable[..., Any]]) -> None:
     """Answer the parent's commands one by one, until it closes the pipe or ends.
 
     Args:
-        commands: what each of them does; called with the command's arguments by keyword, the value
-            returned goes to the parent as JSON.
+        commands: the function for each command. It is called with the command's arguments by
+            keyword, and its return value is sent to the parent as JSON.
     """
     commands = {"ready": lambda: None, **commands}
     for line in sys.stdin.buffer:

@@ -1,7 +1,7 @@
 """A process of stock rclpy servers: ``python -m tests.support.servers``.
 
-Services are made with ``node.create_service`` and spun by a ``SingleThreadedExecutor``. Where a
-test wants an answer late, in another order or never, only the sending of it is put off.
+Services are made with ``node.create_service`` and spun by a ``SingleThreadedExecutor``. If a test
+wants a response late, in another order or never, only sending it is put off.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ __all__ = ["Delay", "ServerProcess", "running"]
 T = TypeVar("T")
 
 Delay = float | tuple[float, float] | Literal["hold", "never"] | None
-"""When a request is answered: at once (None), after so many seconds, after a random time between
-the two, when :meth:`ServerProcess.release` says so, or never."""
+"""When a request is answered: at once (None), after a number of seconds, after a random number of
+seconds between two, when `ServerProcess.release` is called, or never."""
 
 
 @contextmanager
 def running(program: Path) -> Iterator[None]:
-    """Run a program of the documentation, whose stock servers others call meanwhile."""
+    """Run a program of the documentation that serves what others call meanwhile."""
     command = (sys.executable, str(program))
     with (
         profile() as environment,
@@ -48,7 +48,7 @@ def running(program: Path) -> Iterator[None]:
         try:
             server.wait(LIMIT / 4)
         except subprocess.TimeoutExpired:
-            # The signal handler of rclpy shuts the context down, but not always is its spin woken.
+            # rclpy's signal handler shuts the context down, but does not always wake its spin.
             server.kill()
 
 
@@ -67,15 +67,15 @@ class ServerProcess(Child):
         depth: int | None = None,
         copies: int = 1,
     ) -> None:
-        """Create a service; it is there when this returns.
+        """Create a service, and return when it exists.
 
         Args:
-            name: of the service.
+            name: the service's name.
             srv_type: the name of its type.
             delay: when it answers.
-            skip: the first so many requests are not answered.
-            depth: of its history; the default of ROS, 10, where it is left out.
-            copies: how many services to make under this name.
+            skip: how many requests to leave unanswered at first.
+            depth: the depth of its history; None for the default of ROS, 10.
+            copies: how many services to create under this name.
         """
         await self.ask(
             "serve",
@@ -92,20 +92,20 @@ class ServerProcess(Child):
         await self.ask("stop", name=name)
 
     async def change(self, name: str, delay: Delay) -> None:
-        """Answer from now on so; what is held stays held."""
+        """Change when requests are answered from now on; what is held stays held."""
         await self.ask("change", name=name, delay=delay)
 
     async def release(self, name: str, count: int | None = None, *, newest: bool = False) -> None:
-        """Answer requests that are held: all or so many, the oldest (or newest) first."""
+        """Answer held requests, all or ``count`` of them, the oldest (or newest) first."""
         await self.ask("release", name=name, count=count, newest=newest)
 
     async def received(self, name: str, at_least: int = 0) -> list[str]:
-        """What the requests that came so far carried, in order; waits until so many have come."""
+        """Wait until ``at_least`` requests have come; return what all so far carried, in order."""
         result: list[str] = await self.ask("received", name=name, at_least=at_least)
         return result
 
     async def answered(self, name: str, at_least: int = 0) -> int:
-        """How many responses were sent; waits until so many were."""
+        """Wait until ``at_least`` responses have been sent; return how many have been so far."""
         result: int = await self.ask("answered", name=name, at_least=at_least)
         return result
 
@@ -139,7 +139,7 @@ class _Later:
 
 
 class _Service:
-    """One name of the process: its rclpy services, its mode and its counts."""
+    """A service name of the process: its rclpy services, when they answer, and its counts."""
 
     def __init__(self, delay: Delay, skip: int, later: _Later) -> None:
         self.delay = delay
@@ -152,7 +152,7 @@ class _Service:
         self._later = later
 
     def add(self, service: Any) -> None:
-        """Put a service made with ``handle`` under this mode."""
+        """Add a service created with ``handle``, to answer as this name does."""
         service.send_response = partial(self._respond, service.send_response)
         self.services.append(service)
 
@@ -258,7 +258,7 @@ class _Servers:
         self._services.clear()
 
     def _in_executor(self, function: Callable[[], T]) -> T:
-        """Run it in the thread that spins: rclpy has crashed on changes from another one."""
+        """Run it in the thread that spins: rclpy has crashed on changes from another thread."""
         done = threading.Event()
         task = self._executor.create_task(function)
         task.add_done_callback(lambda _: done.set())

@@ -1,4 +1,4 @@
-"""Cancel a call at a chosen await of its way, and at a chosen moment of that await."""
+"""Cancel a call at a chosen await, and at a chosen moment of that await."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ __all__ = ["MOMENTS", "Moment", "Victim", "every_victim"]
 T = TypeVar("T")
 
 Moment = Literal["as it suspends", "in the next turn", "as it wakes"]
-"""When the cancellation comes: before the loop has seen the await; in the turn after; or when what
-is awaited is done already, and only the task does not know it yet."""
+"""When the cancellation comes: before the loop has seen the await, in the turn after, or when what
+is awaited is done but the task has not been resumed."""
 
 MOMENTS: tuple[Moment, ...] = get_args(Moment)
 
@@ -23,9 +23,9 @@ class Victim:
     """A task that runs a coroutine and is cancelled at one of its awaits.
 
     Args:
-        coroutine: to run.
-        suspension: which await, counted from 0.
-        moment: of that await.
+        coroutine: the coroutine to run.
+        suspension: the number of the await, counted from 0.
+        moment: when in that await to cancel.
     """
 
     def __init__(self, coroutine: Coroutine[Any, Any, Any], suspension: int, moment: Moment):
@@ -59,21 +59,21 @@ async def every_victim(
     make: Callable[[], Coroutine[Any, Any, Any]],
     moments: tuple[Moment, ...] = MOMENTS,
 ) -> AsyncIterator[Victim]:
-    """Give one victim after the other, until a call has no such await any more.
+    """Yield a victim for each moment of each await, until the call has no further await.
 
     Args:
-        make: makes the coroutine of the next victim, which begins when it is given.
-        moments: of each await.
+        make: makes the coroutine of the next victim, which starts when the victim is yielded.
+        moments: the moments to try at each await.
     """
     for suspension in itertools.count():
         struck = False
         for moment in moments:
             victim = Victim(make(), suspension, moment)
             yield victim
-            assert victim.task.done(), "the test has to see its victim's end"
+            assert victim.task.done(), "the test has to wait for its victim"
             struck = struck or victim.struck
         if not struck:
-            assert suspension > 0, "a call that never waits shows nothing"
+            assert suspension > 0, "the call never waits, so nothing was tested"
             return
 
 
@@ -81,7 +81,7 @@ async def every_victim(
 def _watched(
     coroutine: Coroutine[Any, Any, T], suspended: Callable[[Any], None]
 ) -> Generator[Any, Any, T]:
-    """Run a coroutine as ``await`` does, telling what it waits for each time it suspends."""
+    """Run a coroutine as ``await`` does, and report what it waits for at each suspension."""
     try:
         awaited = coroutine.send(None)
         while True:

@@ -1,4 +1,4 @@
-"""The one unit of time of the tests: every delay, timeout and limit is a multiple of ``TICK``."""
+"""The unit of time of the tests: every delay, timeout and limit is a multiple of ``TICK``."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from collections.abc import Callable
 __all__ = ["LIMIT", "TICK", "until"]
 
 TICK = 0.05
-"""Seconds: long beside a call (about 0.3 ms), short beside a test."""
+"""Seconds: much longer than a call (about 0.3 ms), much shorter than a test."""
 
 LIMIT = 400 * TICK
-"""Seconds after which anything that was to happen is taken to have failed."""
+"""Seconds after which a test gives up waiting. Long enough for a machine with other work."""
 
 
 async def until(condition: Callable[[], object], limit: float = LIMIT) -> None:
-    """Wait for a state that has no event of its own, as a statistics counter.
+    """Wait for a state that has no event of its own, such as a statistics counter.
 
     Args:
-        condition: called in the loop every tenth of a tick until it answers truly.
-        limit: seconds.
+        condition: called in the loop every tenth of a tick until it returns something true.
+        limit: seconds to wait.
 
     Raises:
-        AssertionError: the condition did not come true in time.
+        AssertionError: the condition did not become true in time.
     """
     deadline = time.monotonic() + limit
     while not condition():

@@ -1,0 +1,112 @@
+"""A user's program: what the checkers infer of each call; read by them, never run."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Mapping
+from concurrent.futures import Future
+from typing import Any, assert_type
+
+from std_srvs.srv import SetBool, Trigger
+
+import rosasync
+from rosasync import AsyncServiceProxy, LeasedClient, ServiceCall, ServiceClient, ServiceServer
+
+NAME = "std_srvs/srv/SetBool"
+
+
+async def calls(session: rosasync.Session) -> None:
+    response = await session.call(SetBool, "/arm/enable", SetBool.Request(data=True))
+    assert_type(response, SetBool.Response)
+    assert_type(await session.call(SetBool, "/arm/enable", {"data": True}), SetBool.Response)
+    assert_type(await session.call(Trigger, "/arm/home", timeout=None), Trigger.Response)
+    assert_type(await session.call(NAME, "/arm/enable", {"data": True}), Any)
+    print(response.message.upper())
+
+
+async def tasks(session: rosasync.Session) -> None:
+    task = session.start(SetBool, "/arm/enable", SetBool.Request(data=True), timeout=2.0)
+    assert_type(task, asyncio.Task[SetBool.Response])
+    assert_type(await task, SetBool.Response)
+    assert_type(session.start(NAME, "/arm/enable"), asyncio.Task[Any])
+
+
+async def clients(session: rosasync.Session) -> None:
+    client = session.client(SetBool, "/arm/enable")
+    assert_type(client, ServiceClient[SetBool.Request, SetBool.Response])
+    assert_type(await client.call(SetBool.Request(data=True)), SetBool.Response)
+    assert_type(await client.call({"data": True}, timeout=1.0), SetBool.Response)
+    assert_type(client.start(), asyncio.Task[SetBool.Response])
+    assert_type(await session.client(NAME, "/arm/enable").call(), Any)
+
+
+async def leases(session: rosasync.Session) -> None:
+    async with session.pool.lease(SetBool, "/arm/enable") as client:
+        assert_type(client, LeasedClient[SetBool.Request, SetBool.Response])
+        assert_type(await client.call(SetBool.Request(data=True)), SetBool.Response)
+    async with session.pool.lease(NAME, "/arm/enable") as named:
+        assert_type(await named.call(), Any)
+
+
+def plain(request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+    response.success = request.data
+    return response
+
+
+async def later(request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+    await asyncio.sleep(1.0)
+    return plain(request, response)
+
+
+def deferred(call: ServiceCall[SetBool.Request, SetBool.Response]) -> None:
+    assert_type(call.request, SetBool.Request)
+    assert_type(call.response, SetBool.Response)
+    call.respond(SetBool.Response(success=call.request.data))
+
+
+async def by_call(call: ServiceCall[SetBool.Request, SetBool.Response]) -> SetBool.Response:
+    await asyncio.sleep(1.0)
+    return call.response
+
+
+def untyped(request: Any, response: Any) -> Any:
+    return response
+
+
+async def servers(session: rosasync.Session) -> None:
+    server = session.serve(SetBool, "/arm/enable", plain)
+    assert_type(server, ServiceServer[SetBool.Request, SetBool.Response])
+    session.serve(SetBool, "/arm/enable", later)
+    session.serve(SetBool, "/arm/enable", deferred)
+    session.serve(SetBool, "/arm/enable", by_call)
+    session.serve(SetBool, "/arm/enable", untyped)
+    session.serve(NAME, "/arm/enable", plain)
+    async with session.serve(SetBool, "/arm/enable") as iterated:
+        async for call in iterated:
+            assert_type(call, ServiceCall[SetBool.Request, SetBool.Response])
+            assert_type(call.request, SetBool.Request)
+            call.respond(SetBool.Response(success=call.request.data))
+
+
+def threads(session: rosasync.Session) -> None:
+    portal = session.from_thread
+    assert_type(portal.call(SetBool, "/arm/enable", {"data": True}), SetBool.Response)
+    future = portal.submit(SetBool, "/arm/enable", SetBool.Request(data=True))
+    assert_type(future, Future[SetBool.Response])
+    assert_type(future.result(timeout=1.0), SetBool.Response)
+    assert_type(portal.call(NAME, "/arm/enable"), Any)
+
+
+def ticks(session: rosasync.Session) -> None:
+    proxy = AsyncServiceProxy(session, SetBool, "/arm/enable")
+    assert_type(proxy, AsyncServiceProxy[SetBool.Request, SetBool.Response])
+    proxy.call_service(SetBool.Request(data=True), timeout=2.0)
+    assert_type(proxy.get_response(), SetBool.Response | None)
+
+
+async def generic(
+    session: rosasync.Session,
+    kinds: Mapping[str, rosasync.ServiceType[SetBool.Request, SetBool.Response]],
+) -> None:
+    kind = kinds["enable"]
+    assert_type(await session.call(kind, "/arm/enable", SetBool.Request()), SetBool.Response)
