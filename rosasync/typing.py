@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar
 
 __all__ = [
     "RequestT",
-    "RequestT_co",
     "ResponseT",
     "ResponseT_co",
     "ServiceType",
@@ -23,21 +22,22 @@ if TYPE_CHECKING:
 else:
     RequestT = TypeVar("RequestT")
     ResponseT = TypeVar("ResponseT")
-RequestT_co = TypeVar("RequestT_co", covariant=True)
 ResponseT_co = TypeVar("ResponseT_co", covariant=True)
 
 Timeout: TypeAlias = float | EllipsisType | None
 """Seconds; None for no deadline; ``...``, or left out, for the callee's default."""
 
 
-class ServiceType(Protocol[RequestT_co, ResponseT_co]):
+# Invariant in the request: otherwise a checker finds a common base of the service's request and of
+# the one that is passed, and accepts any message.
+class ServiceType(Protocol[RequestT, ResponseT_co]):  # type: ignore[misc]
     """A service class, such as ``std_srvs.srv.SetBool``; every generated one fits.
 
     Its members are methods, because type checkers accept a nested class for a method, but not all
     of them for a property or an attribute.
     """
 
-    def Request(self) -> RequestT_co:
+    def Request(self) -> RequestT:
         """Make a request."""
         ...
 

@@ -44,16 +44,19 @@ async def lease_call(session: Session, request: object, **options: Any) -> objec
 
 
 async def portal_call(session: Session, request: object, **options: Any) -> object:
-    return await asyncio.to_thread(session.from_thread.call, ECHO, NAME, request, **options)
+    portal = session.from_thread
+    return await asyncio.to_thread(lambda: portal.call(ECHO, NAME, request, **options))
 
 
 async def portal_submit(session: Session, request: object, **options: Any) -> object:
-    return await asyncio.to_thread(session.from_thread.submit, ECHO, NAME, request, **options)
+    portal = session.from_thread
+    return await asyncio.to_thread(lambda: portal.submit(ECHO, NAME, request, **options))
 
 
 async def proxy_call(session: Session, request: object, **options: Any) -> object:
     proxy = AsyncServiceProxy(session, ECHO, NAME)
-    return proxy.call_service(request, **options)
+    proxy.call_service(request, **options)
+    return proxy
 
 
 WAYS: list[Way] = [

@@ -389,7 +389,7 @@ async def test_bad_services_raise_when_the_proxy_is_made() -> None:
         with pytest.raises(ValueError, match="no_pkg"):
             AsyncServiceProxy(session, "no_pkg/srv/Type", NAME)
         with pytest.raises(TypeError):
-            AsyncServiceProxy(session, 5, NAME)
+            AsyncServiceProxy(session, 5, NAME)  # type: ignore[arg-type]
     with pytest.raises(SessionClosed):
         AsyncServiceProxy(session, ECHO, NAME)
     with pytest.raises(UsageError, match="not open"):

@@ -41,9 +41,9 @@ RCLError: type[Exception] = rclpy_implementation.RCLError
 
 async def test_other_bad_arguments(session: Session) -> None:
     with pytest.raises(TypeError, match="on_error"):
-        session.serve(ECHO, "/bad", echo_call, on_error=3)  # type: ignore[arg-type]
+        session.serve(ECHO, "/bad", echo_call, on_error=3)  # type: ignore[call-overload]
     with pytest.raises(TypeError, match="on_overload"):
-        session.serve(ECHO, "/bad", echo_call, on_overload="x")  # type: ignore[arg-type]
+        session.serve(ECHO, "/bad", echo_call, on_overload="x")  # type: ignore[call-overload]
     with pytest.raises(ValueError, match="concurrency"):
         session.serve(ECHO, "/bad", echo_call, concurrency=0)
     with pytest.raises(ValueError, match="backlog"):

@@ -169,7 +169,7 @@ async def test_a_client_destroyed_by_other_means_is_replaced(fake_graph: FakeGra
     async with fake_graph.session() as session:
         assert await ask(session, 0) == 0
         (client,) = session.pool.service(Echo, "/echo", None).clients
-        client.send = raise_destroyed
+        client.send = raise_destroyed  # type: ignore[assignment]
         with pytest.raises(ContextShutdown, match="/echo: the client was destroyed"):
             await ask(session, 1)
         assert await ask(session, 2) == 2
