@@ -27,6 +27,12 @@ PROCESSES = 4
 EACH = 10
 
 
+def rounds(few: int, *, soak: int) -> list[Any]:
+    """Repetitions of a test; those after the first few run only under the marker ``soak``."""
+    more = [pytest.param(number, marks=pytest.mark.soak) for number in range(few, soak)]
+    return [*range(few), *more]
+
+
 @pytest.fixture(scope="module")
 def crowd() -> Iterator[list[ClientProcess]]:
     """Four processes of stock clients."""
@@ -57,7 +63,7 @@ async def burst(
 
 async def join(process: ClientProcess, name: str, seen: set[str], **options: Any) -> None:
     """Have a process call on and on, and wait until a call of its own arrives."""
-    await process.start(name, None, in_flight=EACH, depth=1000, **options)
+    await process.start(name, None, depth=1000, **options)
     await until(lambda: str(process.pid) in seen)
 
 
@@ -162,17 +168,17 @@ async def test_a_thousand_answers_from_four_threads(
             assert answerers.refused == statistics.dropped == 0
 
 
-@pytest.mark.parametrize("round_", range(3))
+@pytest.mark.parametrize("round_", rounds(1, soak=3))
 async def test_the_server_closes_while_four_threads_answer(
     session: Session, crowd: list[ClientProcess], name: str, round_: int
 ) -> None:
+    in_flight = PROCESSES * 5 * EACH
     answerers = Answerers()
     with answerers.working():
         server = session.serve(ECHO, name, answerers.take)
         for process in crowd:
-            await join(process, name, answerers.seen, clients=5, timeout=10 * TICK)
-        # Of what is sent last, as many as are out may be lost with the server's writer.
-        enough = server.statistics().responded + 1000 + 2 * PROCESSES * 5 * EACH
+            await join(process, name, answerers.seen, clients=5, in_flight=EACH)
+        enough = server.statistics().responded + 5 * in_flight
         await until(lambda: server.statistics().responded > enough)
         await server.aclose()
     statistics = server.statistics()
@@ -180,11 +186,15 @@ async def test_the_server_closes_while_four_threads_answer(
     assert answerers.refused == statistics.dropped
     tallies = [await process.result() for process in crowd]
     assert sum(tally.wrong for tally in tallies) == 0
-    assert 1000 < sum(tally.answered for tally in tallies) <= statistics.responded
+    # The middleware destroys the server's writer with what it has not delivered: no more than what
+    # the clients had in flight.
+    answered = sum(tally.answered for tally in tallies)
+    assert statistics.responded - in_flight <= answered <= statistics.responded
 
 
-async def test_closed_and_opened_again_200_times(
-    session: Session, crowd: list[ClientProcess]
+@pytest.mark.parametrize("times", [40, pytest.param(200, marks=pytest.mark.soak)])
+async def test_closed_and_opened_again(
+    session: Session, crowd: list[ClientProcess], times: int
 ) -> None:
     seen: set[str] = set()
 
@@ -203,9 +213,11 @@ async def test_closed_and_opened_again_200_times(
         await cycle()
     async with session.serve(ECHO, "/reopened", handler):
         for process in crowd:
+            # One request at a time. More of them, repeated every 50 ms, are more than a server can
+            # answer on a loaded machine: it drops what exceeds its backlog, the session's too.
             await join(process, "/reopened", seen, timeout=TICK)
     before = count_threads(), count_descriptors()
-    for number in range(200):
+    for number in range(times):
         await cycle(foreign=number % 20 == 0)
     assert count_threads() <= before[0]
     assert count_descriptors() <= before[1]
