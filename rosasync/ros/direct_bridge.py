@@ -14,7 +14,7 @@ from rclpy.node import Node
 from rosasync.errors import RosasyncError
 from rosasync.ports import Deliver, DeliverRequest
 from rosasync.ros.busy_poll import BusyPoll
-from rosasync.ros.failures import RclpyError, explain
+from rosasync.ros.failures import RclpyError, explain, is_destroyed
 from rosasync.ros.rcl import Rcl
 from rosasync.ros.responder import Responder
 from rosasync.ros.services import make_service, qos_of, take_requests
@@ -277,7 +277,7 @@ class DirectClient:
         """Have responses wake the loop, including those that have come already."""
         if self._rcl.signal_responses(self.handle, self._signal.fd):
             self._signalling = True
-        elif self.handle.pointer:
+        elif not is_destroyed(self.handle):
             raise RosasyncError(
                 "the middleware does not support new-response callbacks: use bridge='executor'"
             )
@@ -286,10 +286,10 @@ class DirectClient:
         raise self._failure(RosasyncError("the context was shut down"))
 
     def _take_failed(self, error: Exception) -> None:
-        if self.handle.pointer:
-            logger.error("a response could not be taken: %s", error)
-        else:
+        if is_destroyed(self.handle):
             self._pending.clear()
+        else:
+            logger.error("a response could not be taken: %s", error)
 
     def _failure(self, error: Exception) -> Exception:
         return explain(self._node, self.handle, error)
@@ -332,7 +332,7 @@ class DirectService:
     @property
     def destroyed(self) -> bool:
         """Whether something else than rosasync has destroyed the service."""
-        return not self._closed and not self._service.pointer
+        return not self._closed and is_destroyed(self._service)
 
     def take(self, most: int) -> None:
         """Take ``most`` times and then deliver, so that the queue is emptied soon."""

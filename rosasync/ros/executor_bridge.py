@@ -15,7 +15,7 @@ from rclpy.node import Node
 from rosasync.errors import RosasyncError, SessionClosed
 from rosasync.gateway import LoopGateway
 from rosasync.ports import Deliver, DeliverRequest, RequestHeader
-from rosasync.ros.failures import RclpyError, explain
+from rosasync.ros.failures import RclpyError, explain, is_destroyed
 from rosasync.ros.responder import Responder
 from rosasync.ros.services import make_service, qos_of, take_request
 
@@ -207,7 +207,7 @@ class ExecutorService:
     @property
     def destroyed(self) -> bool:
         """Whether something else than rosasync has destroyed the service."""
-        return not self._closed and not self._service.pointer
+        return not self._closed and is_destroyed(self._service)
 
     def stop(self) -> None:
         """Stop delivering requests; idempotent."""

@@ -13,7 +13,7 @@ from rclpy.node import Node
 from rosasync.errors import ContextShutdown, RosasyncError, UsageError
 from rosasync.ports import PortDestroyed, Service
 
-__all__ = ["RclpyError", "check_up", "explain", "is_up", "refusal", "uses_node"]
+__all__ = ["RclpyError", "check_up", "explain", "is_destroyed", "is_up", "refusal", "uses_node"]
 
 RclpyError = (InvalidHandle, rclpy_implementation.RCLError)
 """What rclpy raises if an entity was destroyed, or if rcl reports an error."""
@@ -21,7 +21,16 @@ RclpyError = (InvalidHandle, rclpy_implementation.RCLError)
 
 def is_up(node: Node) -> bool:
     """Return whether the node and its context are up."""
-    return bool(node.context.ok()) and bool(node.handle.pointer)
+    return bool(node.context.ok()) and not is_destroyed(node.handle)
+
+
+def is_destroyed(handle: Any) -> bool:
+    """Return whether an entity was destroyed, or will be as soon as it is not in use any more."""
+    try:
+        with handle:
+            return not handle.pointer
+    except InvalidHandle:
+        return True
 
 
 def check_up(node: Node) -> None:
@@ -40,7 +49,7 @@ def explain(node: Node, handle: Any, error: Exception) -> Exception:
     """
     if not is_up(node):
         return _context_shut_down()
-    if not handle.pointer:
+    if is_destroyed(handle):
         return PortDestroyed("the rclpy client or service was destroyed")
     return RosasyncError(f"rclpy failed: {error}")
 

@@ -22,7 +22,7 @@ from rosasync.ros.endpoints import (
     request_writers,
     response_readers,
 )
-from rosasync.ros.failures import RclpyError, explain, uses_node
+from rosasync.ros.failures import RclpyError, explain, is_destroyed, uses_node
 
 __all__ = ["Responder", "client_of"]
 
@@ -129,7 +129,8 @@ class Responder:
         unreached = self._check(header) if self._watching else None
         started = monotonic()
         try:
-            self._send(response, header.request_id)
+            with self._handle:
+                self._send(response, header.request_id)
         except RclpyError as error:
             raise self._failure(error) from error
         except SystemError as error:
@@ -153,7 +154,7 @@ class Responder:
             return bool(self._node.handle.get_count_clients(self._srv_name))
 
     def _failure(self, error: Exception) -> Exception:
-        if not self._handle.pointer:
+        if is_destroyed(self._handle):
             return explain(self._node, self._handle, error)
         return Undeliverable(str(error))
 
