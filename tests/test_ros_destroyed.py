@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import os
+import subprocess
+import sys
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -21,6 +24,7 @@ from tests.conftest import Bridge
 from tests.support.checks import count_descriptors, count_threads
 from tests.support.echo import ECHO, request_of
 from tests.support.nodes import borrowed_node, open_node, reports
+from tests.support.process import ROOT
 from tests.support.serving import echo_of
 from tests.support.times import LIMIT, until
 
@@ -189,6 +193,61 @@ async def test_a_node_that_is_down_already(bridge: Bridge) -> None:
             with pytest.raises(ContextShutdown):
                 async with open_node(bridge, node):
                     pass
+
+
+FULL = """
+import asyncio, contextlib, gc, os, resource, sys
+from rosasync.errors import RosasyncError
+from tests.support.checks import count_descriptors
+from tests.support.nodes import open_node
+
+def fill(spare):
+    taken = []
+    with contextlib.suppress(OSError):
+        while True:
+            taken.append(os.open(os.devnull, os.O_RDONLY))
+    for _ in range(spare):
+        os.close(taken.pop())
+    return taken
+
+async def main(bridge):
+    for _ in range(2):
+        async with open_node(bridge):
+            pass
+    hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    resource.setrlimit(resource.RLIMIT_NOFILE, (200, hard))
+    before = count_descriptors()
+    outcomes = []
+    for spare in (0, 1, 2, 30):
+        taken = fill(spare)
+        try:
+            async with open_node(bridge):
+                outcomes.append("opened")
+        except (RosasyncError, OSError):
+            outcomes.append("refused")
+        for descriptor in taken:
+            os.close(descriptor)
+        gc.collect()
+        assert count_descriptors() == before, (spare, outcomes)
+    print("\\noutcomes:", *outcomes, flush=True)
+
+asyncio.run(main(sys.argv[1]))
+"""
+
+
+async def test_a_process_without_descriptors_opens_no_node_and_leaks_none(bridge: Bridge) -> None:
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-c", FULL, bridge),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        cwd=ROOT,
+    )
+    output, errors = await process.communicate()
+    assert process.returncode == 0, errors.decode()
+    # Fast DDS logs to the same stream.
+    lines = [line.split() for line in output.decode().splitlines()]
+    outcomes = next(line[1:] for line in lines if line[:1] == ["outcomes:"])
+    assert (outcomes[0], outcomes[-1]) == ("refused", "opened")
 
 
 def no_descriptor(*_: Any) -> int:

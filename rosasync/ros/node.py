@@ -214,22 +214,25 @@ class RosNode:
         if not isinstance(node, str):
             kind = type(node).__name__
             raise TypeError(f"node must be a name or an rclpy.node.Node, not {kind}")
+        context = options.context
+        if context is not None and not context.ok():
+            raise UsageError("the context is not initialised, or was shut down: rclpy.init() it")
         try:
-            self._own_node = Node(node, context=self._context(options.context))
+            self._own_node = Node(
+                node, context=self._make_context() if context is None else context
+            )
         except InvalidNodeNameException as error:
             reason = str(error).strip().replace("\n", " ")
             raise ValueError(f"{node!r} is not a valid node name: {reason}") from None
-        except RclpyError as error:
+        except RuntimeError as error:
+            # RCLError, or what C++ throws if the process is out of file descriptors.
             raise RosasyncError(f"rclpy cannot create the node {node!r}: {error}") from error
         return self._own_node
 
-    def _context(self, context: Context | None) -> Context:
-        if context is None:
-            context = self._own_context = Context()
-            rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
-        elif not context.ok():
-            raise UsageError("the context is not initialised, or was shut down: rclpy.init() it")
-        return context
+    def _make_context(self) -> Context:
+        self._own_context = Context()
+        rclpy.init(context=self._own_context, signal_handler_options=SignalHandlerOptions.NO)
+        return self._own_context
 
     def _make_bridge(self, options: SessionOptions, librcl: rcl.Rcl | None) -> Bridge:
         tried = rclpy.get_rmw_implementation_identifier() in DIRECT_TRIED

@@ -7,7 +7,7 @@ import struct
 from collections import Counter
 from dataclasses import dataclass
 from time import monotonic
-from typing import Any
+from typing import Any, NoReturn
 
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
@@ -98,11 +98,11 @@ class ClientGraph:
 class Responder:
     """Sends the responses of one service. Its methods may be called on any thread.
 
-    rclpy holds the GIL while it sends. A client that is not matched, the middleware awaits for
-    0.1 s (by default) before it drops the response. This happens if a packet of the discovery was
-    lost, or if the QoS of the client does not match. So after a slow send, and only then, the
-    client is identified. Further responses to it are sent when the graph shows that they can
-    arrive, and refused without sending until then.
+    The middleware waits for a client that is not matched, by default for 0.1 s, and then drops the
+    response. A client is not matched if a packet of its discovery was lost, or if its QoS does not
+    fit. rclpy holds the GIL meanwhile, so the whole process stops. To prevent a second stop, the
+    client is identified after a slow send. Further responses to it are sent only when the graph
+    shows that they can arrive.
     """
 
     def __init__(self, node: Node, service: Service, qos: QoSProfile) -> None:
@@ -170,7 +170,7 @@ class Responder:
         self._graph.refresh(monotonic())
         return guid not in self._graph.readers and not self._graph.empty
 
-    def _fail(self, header: RequestHeader, reason: str) -> None:
+    def _fail(self, header: RequestHeader, reason: str) -> NoReturn:
         """Remember the client and raise the error that says whether to send again."""
         now = monotonic()
         self._watch_until = now + WATCH_TIME
@@ -181,8 +181,8 @@ class Responder:
         known = self._unreached.get(guid)
         if known is None:
             self._unreached[guid] = Unreached()
-            if len(self._unreached) > MOST_UNREACHED:
-                self._unreached.pop(next(iter(self._unreached)), None)
+            for oldest in tuple(self._unreached)[:-MOST_UNREACHED]:
+                self._unreached.pop(oldest, None)
         else:
             known.given_up = True
         self._graph.refresh(now)
