@@ -181,7 +181,9 @@ class RosNode:
             self._bridge.close()
         if self._thread is not None:
             self._thread.close()
-        if self._user_executor is not None and self._node.executor is self._user_executor:
+        # Not kept afterwards: a MultiThreadedExecutor ends its threads when it is collected.
+        executor, self._user_executor = self._user_executor, None
+        if executor is not None and self._node.executor is executor:
             self._node.executor = None
         if self._own_node is not None:
             self._own_node.destroy_node()
