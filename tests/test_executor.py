@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,7 +17,7 @@ from std_msgs.msg import Empty
 
 from rosasync import Limits, Session
 from tests.support.checks import assert_clean, check_call
-from tests.support.times import LIMIT, TICK
+from tests.support.times import LIMIT, TICK, until
 
 if TYPE_CHECKING:
     from tests.conftest import Bridge
@@ -224,3 +225,81 @@ class TestBorrowed:
                     *(check_call(two, echo, f"two {n}") for n in range(50)),
                 )
             executor.remove_node(node)
+
+    async def test_a_node_that_the_user_spins_later(
+        self, bridge: Bridge, node: Any, echo: str
+    ) -> None:
+        """A session that ends leaves it in the executor that has it by then."""
+        executor = SingleThreadedExecutor(context=node.context)
+        async with Session(node, bridge=bridge) as session:
+            await check_call(session, echo, "before")
+            executor.add_node(node)
+            with spinning(executor):
+                await check_call(session, echo, "after")
+                await session.aclose()
+                assert node.executor is executor
+                assert node in executor.get_nodes()
+                executor.remove_node(node)
+
+
+class TestShared:
+    """Two sessions on one node that no executor has: one thread, until both have ended."""
+
+    async def test_the_one_that_stays_is_still_spun(
+        self, bridge: Bridge, node: Any, echo: str
+    ) -> None:
+        half = Limits(in_flight=5)
+        loop = asyncio.get_running_loop()
+        for first, second in ((0, 1), (1, 0)):
+            sessions = [Session(node, bridge=bridge, limits=half) for _ in range(2)]
+            for session in sessions:
+                await session.__aenter__()
+                await check_call(session, echo, "both")
+            names = [thread.name for thread in threading.enumerate()]
+            assert names.count("rosasync executor of lender") == 1
+            await sessions[first].aclose()
+            ticked = asyncio.Event()
+            timer = node.create_timer(
+                TICK / 5, functools.partial(loop.call_soon_threadsafe, ticked.set)
+            )
+            async with asyncio.timeout(LIMIT):
+                await ticked.wait()
+            for number in range(20):
+                await check_call(sessions[second], echo, str(number))
+            await assert_clean(sessions[second])
+            node.destroy_timer(timer)
+            await sessions[second].aclose()
+            assert node.executor is None
+
+    async def test_sessions_of_several_threads_come_and_go(
+        self, bridge: Bridge, node: Any, echo: str
+    ) -> None:
+        """Each has a loop of its own, and each of its calls is answered."""
+
+        async def come_and_go(name: int) -> None:
+            limits = Limits(in_flight=1)
+            for number in range(10):
+                async with Session(node, bridge=bridge, limits=limits) as session:
+                    await check_call(session, echo, f"{name} {number}", timeout=LIMIT)
+
+        threads = (asyncio.to_thread(asyncio.run, come_and_go(name)) for name in range(4))
+        await asyncio.gather(*threads)
+        assert node.executor is None
+        names = [thread.name for thread in threading.enumerate()]
+        assert "rosasync executor of lender" not in names
+
+    async def test_a_callback_that_raises_is_reported_once(self, bridge: Bridge, node: Any) -> None:
+        reported: list[dict[str, Any]] = []
+        asyncio.get_running_loop().set_exception_handler(
+            lambda _, details: reported.append(details)
+        )
+
+        def fail() -> None:
+            timer.cancel()
+            raise ZeroDivisionError("in the timer")
+
+        async with Session(node, bridge=bridge) as one, Session(node, bridge=bridge):
+            timer = node.create_timer(0.0, fail)
+            await until(lambda: reported)
+            await one.aclose()
+        assert len(reported) == 1

@@ -1,137 +1,366 @@
-"""Sending responses: what happens where the client is not quite discovered."""
+"""Sending responses to clients that are not matched: when to send, to wait, and to give up."""
 
 from __future__ import annotations
 
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 
-from rosasync.ports import Unmatched
-from rosasync.ros import services
-from rosasync.ros.services import Responder
-from rosasync.service_call import RESEND
-from tests.support.echo import ECHO
-from tests.support.serving import FORMS
-from tests.support.times import TICK, until
+from rosasync.errors import ContextShutdown
+from rosasync.ports import PortDestroyed, Undeliverable, Unmatched
+from rosasync.ros import responder
+from rosasync.ros.responder import (
+    MATCH_DELAY,
+    MOST_UNREACHED,
+    POLL_INTERVAL,
+    WATCH_TIME,
+    Responder,
+    client_of,
+)
+from rosasync.server import RESEND
+from tests.support.times import LIMIT
 
-if TYPE_CHECKING:
-    from rosasync import Session
-    from tests.support.clients import ClientProcess
-
-
-class Middleware:
-    """A service whose next sends are in vain, and a graph that shows what it is told to."""
-
-    def __init__(self) -> None:
-        self.name = "/served"
-        self.handle = self
-        self.in_vain = 0
-        self.sent = 0
-        self.endpoints: dict[str, list[bytes]] = {"rq/servedRequest": [], "rr/servedReply": []}
-
-    def service_send_response(self, response: object, request_id: object) -> None:
-        """As rclpy does under `warnings.filterwarnings("error")`."""
-        self.sent += 1
-        if self.in_vain:
-            self.in_vain -= 1
-            raise SystemError from RuntimeWarning("client will not receive response")
-
-    def get_publishers_info_by_topic(self, name: str, no_mangle: bool) -> list[Any]:
-        assert no_mangle
-        return [SimpleNamespace(endpoint_gid=list(gid)) for gid in self.endpoints[name]]
-
-    get_subscriptions_info_by_topic = get_publishers_info_by_topic
+BLOCKED = 0.1
+"""Seconds for which the middleware waits for a client."""
+STEP = 1.2 * max(POLL_INTERVAL, MATCH_DELAY)
+VOLATILE = QoSProfile(depth=10)
+TRANSIENT = QoSProfile(depth=10, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 
 
-def endpoint(process: int, number: int) -> bytes:
+def guid(process: int, number: int) -> bytes:
     return bytes([process] * 12 + [number] * 4)
 
 
+GOOD, BAD = guid(1, 4), guid(2, 4)
+
+
+class Header:
+    """The header of a request, which tells its client if ``known``."""
+
+    def __init__(self, client: bytes, known: bool = True) -> None:
+        self.client = client
+        self.known = known
+        self.request_id: Any = self
+        self.sequence_number = 1
+        self.source_timestamp = self.received_timestamp = 0
+
+
+class Middleware:
+    """A node, its only service and the graph, with a clock of their own.
+
+    Attributes:
+        now: what ``monotonic`` returns.
+        unmatched: the clients to which a send waits and fails.
+        report: how a failure is reported: "error", "warning" or "nothing".
+        sent: the clients that were sent to, in order.
+        queries: how often the graph was queried.
+    """
+
+    def __init__(self) -> None:
+        self.handle = self.context = self
+        self.pointer = 1
+        self.up = True
+        self.service_name = "/served"
+        self.now = 100.0
+        self.unmatched: set[bytes] = set()
+        self.report = "error"
+        self.sent: list[bytes] = []
+        self.queries = 0
+        self.readers: dict[bytes, QoSProfile] = {}
+        self.writers: list[bytes] = []
+
+    def __enter__(self) -> None:
+        """As a handle in use."""
+
+    def __exit__(self, *_: object) -> None:
+        """As a handle that is not in use any more."""
+
+    def ok(self) -> bool:
+        return self.up
+
+    def join(self, client: bytes, qos: QoSProfile = VOLATILE, *, reader: bool = True) -> None:
+        """Show a client in the graph: its writer, and its reader."""
+        self.writers.append(client[:12] + bytes([client[-1] - 1] * 4))
+        if reader:
+            self.readers[client] = qos
+
+    def leave(self, client: bytes) -> None:
+        """Show a client no more."""
+        self.readers.pop(client, None)
+        self.writers.remove(client[:12] + bytes([client[-1] - 1] * 4))
+
+    def service_send_response(self, response: object, request_id: Header) -> None:
+        client = request_id.client
+        self.sent.append(client)
+        if client not in self.unmatched:
+            return
+        self.now += BLOCKED
+        if self.report == "error":
+            raise SystemError from RuntimeWarning("client will not receive response")
+        if self.report == "warning":
+            # As the interpreter does, whatever the filters say.
+            responder.__warningregistry__["version"] = 1
+
+    def get_publishers_info_by_topic(self, name: str, no_mangle: bool) -> list[Any]:
+        assert (name, no_mangle) == ("rq/servedRequest", True)
+        self.queries += 1
+        return [SimpleNamespace(endpoint_gid=list(gid)) for gid in self.writers]
+
+    def get_subscriptions_info_by_topic(self, name: str, no_mangle: bool) -> list[Any]:
+        assert (name, no_mangle) == ("rr/servedReply", True)
+        return [
+            SimpleNamespace(endpoint_gid=list(gid), qos_profile=qos)
+            for gid, qos in self.readers.items()
+        ]
+
+
 @pytest.fixture
-def middleware() -> Middleware:
-    """A server with a client, wholly discovered."""
+def middleware(monkeypatch: pytest.MonkeyPatch) -> Middleware:
+    """A server with one client, which is matched."""
     middleware = Middleware()
-    middleware.endpoints["rq/servedRequest"].append(endpoint(1, 1))
-    middleware.endpoints["rr/servedReply"].append(endpoint(1, 2))
+    middleware.join(GOOD)
+    monkeypatch.setattr(responder, "monotonic", lambda: middleware.now)
+    monkeypatch.setattr(
+        responder, "client_of", lambda header: header.client if header.known else None
+    )
     return middleware
 
 
 @pytest.fixture
-def responder(middleware: Middleware, monkeypatch: pytest.MonkeyPatch) -> Responder:
-    monkeypatch.setattr(services, "LOOK", 0.0)
-    middleware.in_vain = 1
-    responder = Responder(middleware, middleware)
-    with pytest.raises(Unmatched, match="will not receive"):
-        responder.send("response", "id")
-    assert middleware.sent == 1
-    return responder
+def service(middleware: Middleware) -> Responder:
+    return Responder(middleware, middleware, VOLATILE)
 
 
-def test_after_a_send_in_vain_none_is_tried_while_a_client_is_half_known(
-    middleware: Middleware, responder: Responder
+def fail(service: Responder, client: bytes, *, known: bool = True) -> str:
+    """Send a response that cannot arrive now, and return the reason."""
+    with pytest.raises(Unmatched) as caught:
+        service.send(Header(client, known), "response")
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("report", ["error", "warning", "nothing"])
+def test_a_client_that_is_not_discovered_blocks_once(
+    middleware: Middleware, service: Responder, report: str
 ) -> None:
-    middleware.endpoints["rq/servedRequest"].append(endpoint(2, 1))
+    middleware.report = report
+    middleware.unmatched.add(BAD)
+    middleware.join(BAD, reader=False)
+    fail(service, BAD)
     for _ in range(100):
-        with pytest.raises(Unmatched, match="not quite discovered"):
-            responder.send("response", "id")
-    assert middleware.sent == 1
-    middleware.endpoints["rr/servedReply"].append(endpoint(2, 2))
-    responder.send("response", "id")
-    assert middleware.sent == 2
+        assert "not discovered completely" in fail(service, BAD)
+        service.send(Header(GOOD), "response")
+        middleware.now += STEP
+    assert middleware.sent.count(BAD) == 1
+    assert middleware.sent.count(GOOD) == 100
 
 
-def test_readers_of_one_process_do_not_hide_that_another_has_none(
-    middleware: Middleware, responder: Responder
+def test_it_gets_its_responses_when_it_has_been_visible_for_a_moment(
+    middleware: Middleware, service: Responder
 ) -> None:
-    middleware.endpoints["rq/servedRequest"].append(endpoint(2, 1))
-    middleware.endpoints["rr/servedReply"].append(endpoint(3, 1))
-    with pytest.raises(Unmatched):
-        responder.send("response", "id")
-    assert middleware.sent == 1
+    middleware.unmatched.add(BAD)
+    middleware.join(BAD, reader=False)
+    fail(service, BAD)
+    middleware.now += STEP
+    middleware.readers[BAD] = VOLATILE
+    assert "just now" in fail(service, BAD)
+    middleware.unmatched.clear()
+    middleware.now += STEP
+    for _ in range(5):
+        service.send(Header(BAD), "response")
+    assert middleware.sent == [BAD] * 6
 
 
-def test_a_reader_more_is_no_reason_to_wait(middleware: Middleware, responder: Responder) -> None:
-    middleware.endpoints["rr/servedReply"].append(endpoint(2, 2))
-    responder.send("response", "id")
-    assert middleware.sent == 2
-
-
-def test_a_writer_that_never_gets_a_reader_is_waited_for_only_so_long(
-    middleware: Middleware, responder: Responder, monkeypatch: pytest.MonkeyPatch
+def test_one_that_cannot_be_matched_although_it_is_visible_is_given_up(
+    middleware: Middleware, service: Responder
 ) -> None:
-    middleware.endpoints["rq/servedRequest"].append(endpoint(2, 1))
-    monkeypatch.setattr(services, "monotonic", lambda: responder._wary_until + 1)
-    responder.send("response", "id")
-    assert middleware.sent == 2
+    middleware.unmatched.add(BAD)
+    middleware.join(BAD)
+    fail(service, BAD)
+    for _ in range(100):
+        middleware.now += STEP
+        with pytest.raises(Undeliverable):
+            service.send(Header(BAD), "response")
+    assert middleware.sent == [BAD, BAD]
+    with pytest.raises(Undeliverable, match="does not match it"):
+        service.send(Header(BAD), "response")
 
 
-def test_without_a_send_in_vain_the_graph_is_not_asked(middleware: Middleware) -> None:
-    middleware.endpoints.clear()
-    Responder(middleware, middleware).send("response", "id")
-    assert middleware.sent == 1
-
-
-def test_wary_for_less_time_than_a_server_tries() -> None:
-    assert sum(RESEND) > services.WARY
-
-
-async def test_the_graph_shows_both_ends_of_real_clients(
-    session: Session, client_process: ClientProcess
+@pytest.mark.parametrize("report", ["error", "warning"])
+def test_a_qos_that_cannot_match_is_refused_at_once(
+    middleware: Middleware, service: Responder, report: str
 ) -> None:
-    """Under the names that are looked for, and with as many of each in a process."""
-    session.serve(ECHO, "/served", FORMS["plain, call"])
-    await client_process.start("/served", None, clients=3, timeout=TICK)
-    await session.pool.warm(ECHO, "/served")
+    middleware.report = report
+    middleware.unmatched.add(BAD)
+    middleware.join(BAD, TRANSIENT)
+    for _ in range(100):
+        with pytest.raises(Undeliverable, match="QoS") as caught:
+            service.send(Header(BAD), "response")
+        assert not isinstance(caught.value, Unmatched)
+        service.send(Header(GOOD), "response")
+        middleware.now += 1.0
+    assert middleware.sent.count(BAD) == 1
+    assert middleware.sent.count(GOOD) == 100
 
-    def shown(topic: str, kind: str) -> Any:
-        find = getattr(session.node, f"get_{kind}_info_by_topic")
-        return services._by_process(find(topic, no_mangle=True))
 
-    def counts() -> tuple[Any, Any]:
-        return shown("rq/servedRequest", "publishers"), shown("rr/servedReply", "subscriptions")
+def test_others_that_join_meanwhile_do_not_block_at_all(
+    middleware: Middleware, service: Responder
+) -> None:
+    middleware.unmatched.add(BAD)
+    middleware.join(BAD, reader=False)
+    fail(service, BAD)
+    others = [guid(process, 4) for process in range(10, 20)]
+    for other in others:
+        middleware.join(other, reader=False)
+    middleware.now += STEP
+    for other in others:
+        assert "not discovered" in fail(service, other)
+        middleware.readers[other] = VOLATILE
+    middleware.now += STEP
+    for other in others:
+        service.send(Header(other), "response")
+    assert middleware.sent == [BAD, *others]
 
-    await until(lambda: sorted(counts()[0].values()) == [1, 3])
-    await until(lambda: counts()[0] == counts()[1])
-    await client_process.result()
-    await until(lambda: list(counts()[0].values()) == [1])
+
+def test_a_slow_send_to_a_visible_client_has_sent(
+    middleware: Middleware, service: Responder
+) -> None:
+    """As on a busy machine: nothing was reported."""
+    middleware.report = "nothing"
+    middleware.unmatched.add(GOOD)
+    for _ in range(3):
+        service.send(Header(GOOD), "response")
+    assert middleware.sent == [GOOD] * 3
+
+
+def test_clients_that_left_are_forgotten(middleware: Middleware, service: Responder) -> None:
+    for number in range(5):
+        bad = guid(10 + number, 4)
+        middleware.unmatched = {bad}
+        middleware.join(bad, reader=False)
+        fail(service, bad)
+        middleware.leave(bad)
+        middleware.now += WATCH_TIME
+        middleware.unmatched.clear()
+        service.send(Header(bad), "dropped by the middleware without waiting")
+        assert not service._unreached
+    middleware.now += WATCH_TIME
+    before = middleware.queries
+    for _ in range(10):
+        middleware.now += WATCH_TIME
+        service.send(Header(GOOD), "response")
+    assert middleware.queries == before
+
+
+def test_few_clients_are_remembered(
+    middleware: Middleware, service: Responder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(responder, "MOST_UNREACHED", 3)
+    assert MOST_UNREACHED > 100
+    for number in range(10):
+        bad = guid(10 + number, 4)
+        middleware.unmatched.add(bad)
+        middleware.join(bad, TRANSIENT)
+        middleware.now += 2 * WATCH_TIME
+        with pytest.raises(Undeliverable):
+            service.send(Header(bad), "response")
+    assert len(service._unreached) == 3
+
+
+def test_without_an_identity_one_attempt_in_a_while_may_block(
+    middleware: Middleware, service: Responder
+) -> None:
+    middleware.unmatched.add(BAD)
+    middleware.join(BAD, reader=False)
+    fail(service, BAD, known=False)
+    while middleware.now < 100.0 + WATCH_TIME:
+        fail(service, BAD, known=False)
+        fail(service, GOOD, known=False)
+        middleware.now += STEP
+    assert middleware.sent == [BAD]
+    middleware.readers[BAD] = VOLATILE
+    middleware.unmatched.clear()
+    middleware.now += STEP
+    service.send(Header(BAD, known=False), "response")
+    service.send(Header(GOOD, known=False), "response")
+
+
+def test_without_an_identity_a_qos_that_cannot_match_blocks_once_in_a_while(
+    middleware: Middleware, service: Responder
+) -> None:
+    middleware.unmatched.add(BAD)
+    middleware.join(BAD, TRANSIENT)
+    fail(service, BAD, known=False)
+    while middleware.now < 100.0 + WATCH_TIME:
+        assert "not matched" in fail(service, BAD, known=False)
+        middleware.now += STEP
+    assert middleware.sent == [BAD]
+
+
+def test_the_graph_is_queried_only_after_a_slow_send(
+    middleware: Middleware, service: Responder
+) -> None:
+    for _ in range(10):
+        service.send(Header(GOOD), "response")
+    assert middleware.queries == 0
+    middleware.unmatched.add(BAD)
+    middleware.join(BAD, reader=False)
+    fail(service, BAD)
+    before = middleware.queries
+    for _ in range(100):
+        fail(service, BAD)
+    assert middleware.queries == before
+
+
+def test_a_graph_that_names_topics_otherwise_holds_nothing_back(
+    middleware: Middleware, service: Responder
+) -> None:
+    middleware.readers.clear()
+    middleware.writers.clear()
+    middleware.unmatched.add(GOOD)
+    fail(service, GOOD)
+    middleware.unmatched.clear()
+    middleware.now += STEP
+    service.send(Header(GOOD), "response")
+    assert middleware.sent == [GOOD, GOOD]
+
+
+def test_other_errors_of_the_interpreter_pass(
+    middleware: Middleware, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(response: object, request_id: object) -> None:
+        raise SystemError("another one")
+
+    monkeypatch.setattr(middleware, "service_send_response", failing)
+    with pytest.raises(SystemError, match="another one"):
+        Responder(middleware, middleware, VOLATILE).send(Header(GOOD), "response")
+
+
+def test_what_rcl_refuses_is_named(middleware: Middleware, monkeypatch: pytest.MonkeyPatch) -> None:
+    def failing(response: object, request_id: object) -> None:
+        raise rclpy_implementation.RCLError("refused")
+
+    monkeypatch.setattr(middleware, "service_send_response", failing)
+    service = Responder(middleware, middleware, VOLATILE)
+    with pytest.raises(Undeliverable, match="refused"):
+        service.send(Header(GOOD), "response")
+    middleware.pointer = 0
+    with pytest.raises(ContextShutdown):
+        service.send(Header(GOOD), "response")
+    service._node = Middleware()
+    with pytest.raises(PortDestroyed):
+        service.send(Header(GOOD), "response")
+
+
+def test_a_server_tries_for_longer_than_it_watches() -> None:
+    assert LIMIT > sum(RESEND) > WATCH_TIME
+
+
+def test_what_is_no_header_of_rclpy_has_no_identity() -> None:
+    class rmw_service_info_t:
+        __slots__ = ()
+
+    for header in (Header(GOOD), rmw_service_info_t(), object()):
+        assert client_of(header) is None  # type: ignore[arg-type]

@@ -1,59 +1,73 @@
-"""Busy poll: the loop looks for a response for a while before it goes to sleep for it."""
+"""Busy polling: the loop polls for a response for a while before it sleeps."""
 
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING
+from typing import Protocol
 
-if TYPE_CHECKING:
-    from rosasync.ros.direct_bridge import DirectClient
+__all__ = ["BusyPoll", "Pollable"]
 
-__all__ = ["BusyPoll"]
+
+class Pollable(Protocol):
+    """A client that can be polled instead of signalling."""
+
+    quick: bool
+    """Whether its last response came within the budget."""
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether a response is expected."""
+
+    def take_all(self) -> None:
+        """Take the responses that have come."""
+
+    def start_signalling(self) -> None:
+        """Have responses wake the loop."""
 
 
 class BusyPoll:
-    """After Linux's SO_BUSY_POLL (socket(7)): trades CPU for latency, where that pays.
+    """Trades CPU for latency, as Linux's SO_BUSY_POLL (socket(7)) does.
 
-    After a send the loop looks for the response once in each of its turns, so that every other
-    ready task has its own in between, for ``budget`` seconds at the most. It does so only for a
-    client whose last answer came within the budget, and never while nothing is out. A client that
-    is looked at does not signal: the middleware's thread has nobody to wake.
+    After a send the loop polls for the response once in each of its turns, so that every other
+    ready task runs in between, for ``budget`` seconds at the most. It polls only for a client
+    whose last response came within the budget, and only while a request is pending. A client that
+    is polled does not signal, which saves the middleware's thread a system call.
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop, budget: float) -> None:
         self._loop = loop
         self._budget = budget
-        self._until: dict[DirectClient, float] = {}
-        self._looking = False
+        self._until: dict[Pollable, float] = {}
+        self._polling = False
 
-    def sent(self, client: DirectClient) -> float:
-        """Look for the response to a request that was just sent; the time of the sending."""
+    def sent(self, client: Pollable) -> float:
+        """Poll for the response to a request that was just sent, and return the current time."""
         now = self._loop.time()
         if client.quick:
             self._until[client] = now + self._budget
-            if not self._looking:
-                self._looking = True
-                self._loop.call_soon(self._look)
+            if not self._polling:
+                self._polling = True
+                self._loop.call_soon(self._poll)
         return now
 
-    def answered(self, client: DirectClient, sent: float) -> None:
-        """Learn from an answer."""
+    def answered(self, client: Pollable, sent: float) -> None:
+        """Learn from a response to a request sent at this time of the loop."""
         client.quick = self._loop.time() - sent <= self._budget
 
-    def leave(self, client: DirectClient) -> None:
-        """Look at this client no more."""
+    def leave(self, client: Pollable) -> None:
+        """Stop polling for this client."""
         self._until.pop(client, None)
 
-    def _look(self) -> None:
+    def _poll(self) -> None:
         now = self._loop.time()
         for client, until in tuple(self._until.items()):
             client.take_all()
             if not client.is_waiting:
-                del self._until[client]
+                self._until.pop(client, None)
             elif now >= until:
-                del self._until[client]
+                self._until.pop(client, None)
                 client.quick = False
                 client.start_signalling()
-        self._looking = bool(self._until)
-        if self._looking:
-            self._loop.call_soon(self._look)
+        self._polling = bool(self._until)
+        if self._polling:
+            self._loop.call_soon(self._poll)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -10,17 +11,22 @@ from typing import Any
 from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 
-from rosasync.ports import Deliver, DeliverRequest, RequestHeader
+from rosasync.errors import RosasyncError
+from rosasync.ports import Deliver, DeliverRequest
 from rosasync.ros.busy_poll import BusyPoll
+from rosasync.ros.failures import RclpyError, explain, is_destroyed
 from rosasync.ros.rcl import Rcl
-from rosasync.ros.services import Responder, make_service, qos_of, take_requests
+from rosasync.ros.responder import Responder
+from rosasync.ros.services import make_service, qos_of, take_requests
 from rosasync.ros.signals import Signal, Signals
 
 __all__ = ["DESTROY_DELAY", "DirectBridge", "DirectCallbackGroup"]
 
+logger = logging.getLogger("rosasync")
+
 DESTROY_DELAY = 0.02
-"""Seconds from the end of signalling to the destruction: a thread of the middleware may be on its
-way into the listener, which it then uses after it was freed (rmw_fastrtps issue 632)."""
+"""Seconds from the end of signalling to the destruction. A thread of the middleware may just be
+entering the listener, which it would use after it was freed (rmw_fastrtps issue 632)."""
 
 
 class DirectCallbackGroup(CallbackGroup):  # type: ignore[misc]
@@ -30,19 +36,19 @@ class DirectCallbackGroup(CallbackGroup):  # type: ignore[misc]
     """
 
     def can_execute(self, entity: object) -> bool:
-        """Never."""
+        """Return False."""
         return False
 
     def beginning_execution(self, entity: object) -> bool:
-        """Never."""
+        """Return False."""
         return False
 
     def ending_execution(self, entity: object) -> None:
-        """Nothing began."""
+        """Do nothing, because nothing began."""
 
 
 class DirectBridge:
-    """Takes responses and requests on the loop's thread, when the middleware says so."""
+    """Takes responses and requests on the loop's thread, when the middleware signals them."""
 
     name = "direct"
     destroy_delay = DESTROY_DELAY
@@ -66,20 +72,38 @@ class DirectBridge:
         self._retired: dict[Any, asyncio.TimerHandle] = {}
 
     def open_client(self, srv_type: Any, srv_name: str, qos: Any, deliver: Deliver) -> DirectClient:
-        """Make a client whose responses go to ``deliver``, on the loop's thread."""
+        """Create a client that passes its responses to ``deliver`` on the loop's thread."""
         client = self._node.create_client(
             srv_type, srv_name, qos_profile=qos, callback_group=self._group
         )
-        self._configure(client)
-        return DirectClient(client, self._rcl, self._clients, self._poll, deliver, self._retire)
+        try:
+            self._configure(client)
+            return DirectClient(
+                self._node, client, self._rcl, self._clients, self._poll, deliver, self._retire
+            )
+        except BaseException:
+            self._node.destroy_client(client)
+            raise
 
     def open_service(
         self, srv_type: Any, srv_name: str, qos: Any, deliver: DeliverRequest
     ) -> DirectService:
-        """Make a service whose requests go to ``deliver``, on the loop's thread."""
+        """Create a service that passes its requests to ``deliver`` on the loop's thread."""
         service = make_service(self._node, srv_type, srv_name, _nothing, qos, self._group)
-        self._configure(service)
-        return DirectService(self._node, service, self._rcl, self._services, deliver)
+        try:
+            self._configure(service)
+            return DirectService(self._node, service, self._rcl, self._services, deliver)
+        except BaseException:
+            self._node.destroy_service(service)
+            raise
+
+    def refuse(self) -> None:
+        """Have every later send fail, after the context was shut down.
+
+        rcl sends requests even then, and their responses do not arrive.
+        """
+        for client in self._clients.members:
+            client.refuse()
 
     def close(self) -> None:
         """Destroy the clients and services that are left, then close the eventfds."""
@@ -105,13 +129,14 @@ class DirectBridge:
 
 
 class DirectClient:
-    """A rcl client that the loop's thread takes from."""
+    """An rcl client that the loop's thread takes from."""
 
     __slots__ = (
         "_client",
         "_closed",
         "_deliver",
-        "_out",
+        "_node",
+        "_pending",
         "_poll",
         "_rcl",
         "_response_type",
@@ -122,12 +147,12 @@ class DirectClient:
         "_take",
         "handle",
         "quick",
-        "ready",
         "send_request",
     )
 
     def __init__(
         self,
+        node: Node,
         client: Any,
         rcl: Rcl,
         signals: Signals[DirectClient],
@@ -135,63 +160,81 @@ class DirectClient:
         deliver: Deliver,
         retire: Callable[[Any], None],
     ) -> None:
+        self._node = node
         self._client = client
         self._retire = retire
         self._closed = False
         self._rcl = rcl
         self._signals = signals
-        self._signal = signals.join(self)
         self._poll = poll
         self._deliver = deliver
         self.handle = client.handle
         self._response_type = client.srv_type.Response
-        # rcl checks that its client is valid: a destroyed one is an error here, not a crash.
+        # rcl checks that its client is valid: after the destruction these raise.
         self.send_request = self.handle.send_request
-        self.ready = self.handle.service_server_is_available
         self._take = self.handle.take_response
-        self._out: dict[int, float] = {}
+        self._pending: dict[int, float] = {}
         self._signalling = False
         self.quick = False
+        self._signal = signals.join(self)
 
     @property
     def is_waiting(self) -> bool:
         """Whether a response is expected."""
-        return bool(self._out)
+        return bool(self._pending)
 
     def send(self, request: Any) -> int:
-        """Send a request; its sequence number."""
-        if self.quick:
-            self.stop_signalling()
-        elif not self._signalling:
-            self.start_signalling()
-        sequence_number: int = self.send_request(request)
-        out = self._out
-        if not out:
+        """Send a request and return its sequence number; see `rosasync.ports.ClientPort`."""
+        try:
+            if self.quick:
+                self.stop_signalling()
+            elif not self._signalling:
+                self.start_signalling()
+            sequence_number: int = self.send_request(request)
+        except RclpyError as error:
+            raise self._failure(error) from error
+        pending = self._pending
+        if not pending:
             self._signal.waiting[self] = None
         poll = self._poll
-        out[sequence_number] = 0.0 if poll is None else poll.sent(self)
+        pending[sequence_number] = 0.0 if poll is None else poll.sent(self)
         return sequence_number
 
+    def ready(self) -> bool:
+        """Return whether a server is matched; see `rosasync.ports.ClientPort`."""
+        try:
+            return bool(self.handle.service_server_is_available())
+        except RclpyError as error:
+            raise self._failure(error) from error
+
     def forget(self, sequence_number: int) -> None:
-        """Expect no response to this request any more."""
-        self._out.pop(sequence_number, None)
-        if not self._out:
+        """Stop expecting a response to this request."""
+        self._pending.pop(sequence_number, None)
+        if not self._pending:
             self._signal.waiting.pop(self, None)
 
     def take(self, most: int) -> int:
-        """Take responses until the queue seems empty; how many were this client's."""
+        """Take responses until the queue seems empty, and return how many were this client's."""
         taken = 0
         while taken < most:
-            header, response = self._take(self._response_type)
+            try:
+                header, response = self._take(self._response_type)
+            except RclpyError as error:
+                self._take_failed(error)
+                break
             if header is None:
                 break
             taken += 1
             sequence_number = header.request_id.sequence_number
-            sent = self._out.pop(sequence_number, None)
+            sent = self._pending.pop(sequence_number, None)
             if self._poll is not None and sent is not None:
                 self._poll.answered(self, sent)
-            self._deliver(sequence_number, response)
-        if not self._out:
+            try:
+                self._deliver(sequence_number, response)
+            except Exception as error:
+                # The responses behind it are signalled only once.
+                _report(self._signals.loop, self._deliver, error)
+        if not self._pending:
             self._signal.waiting.pop(self, None)
         return taken
 
@@ -200,26 +243,30 @@ class DirectClient:
         self.take(sys.maxsize)
 
     def drain(self, most: int) -> None:
-        """Take ``most`` times, whatever comes.
+        """Take ``most`` times.
 
-        A response to another process's client, which every client of the name is handed, looks
-        like an empty queue, so that one's own may stand behind it.
+        A response to another process's client, which every client of the name receives, looks like
+        an empty queue, and one for this client may stand behind it.
         """
         for _ in range(most):
             self.take(1)
 
     def stop_signalling(self) -> None:
-        """Let other processes' responses not wake the loop, until the next request."""
+        """Keep responses to other processes from waking the loop, until the next request."""
         if self._signalling:
             self._signalling = False
             self._rcl.signal_responses(self.handle, None)
+
+    def refuse(self) -> None:
+        """Have every later send fail."""
+        self.send_request = self._refuse_request
 
     def close(self) -> None:
         """Stop taking, and have the rcl client destroyed; idempotent."""
         if self._closed:
             return
         self._closed = True
-        self._out.clear()
+        self._pending.clear()
         self.stop_signalling()
         self._signals.leave(self, self._signal)
         if self._poll is not None:
@@ -227,14 +274,29 @@ class DirectClient:
         self._retire(self._client)
 
     def start_signalling(self) -> None:
-        """Have responses wake the loop, those that have come already too."""
-        if not self._rcl.signal_responses(self.handle, self._signal.fd):
-            raise RuntimeError("the middleware does not support new-response callbacks")
-        self._signalling = True
+        """Have responses wake the loop, including those that have come already."""
+        if self._rcl.signal_responses(self.handle, self._signal.fd):
+            self._signalling = True
+        elif not is_destroyed(self.handle):
+            raise RosasyncError(
+                "the middleware does not support new-response callbacks: use bridge='executor'"
+            )
+
+    def _refuse_request(self, request: Any) -> int:
+        raise self._failure(RosasyncError("the context was shut down"))
+
+    def _take_failed(self, error: Exception) -> None:
+        if is_destroyed(self.handle):
+            self._pending.clear()
+        else:
+            logger.error("a response could not be taken: %s", error)
+
+    def _failure(self, error: Exception) -> Exception:
+        return explain(self._node, self.handle, error)
 
 
 class DirectService:
-    """A rcl service that the loop's thread takes from."""
+    """An rcl service that the loop's thread takes from."""
 
     destroy_delay = DESTROY_DELAY
 
@@ -249,37 +311,42 @@ class DirectService:
         self._node = node
         self._rcl = rcl
         self._signals = signals
-        self._signal = signals.join(self)
         self._deliver = deliver
         self.handle = service
         self.qos = qos_of(service)
         self._service = service.handle
         self._request_type = service.srv_type.Request
         self._take = self._service.service_take_request
-        self._responder = Responder(node, service)
+        self._responder = Responder(node, service, self.qos)
+        self.send = self._responder.send
         self.has_clients = self._responder.has_clients
         self._closed = False
         self._stopped = False
+        self._signal = signals.join(self)
         if not rcl.signal_requests(self._service, self._signal.fd):
             self.close()
-            raise RuntimeError("the middleware does not support new-request callbacks")
+            raise RosasyncError(
+                "the middleware does not support new-request callbacks: use bridge='executor'"
+            )
 
     @property
     def destroyed(self) -> bool:
         """Whether something else than rosasync has destroyed the service."""
-        return self._responder.destroyed
-
-    def send(self, header: RequestHeader, response: Any) -> None:
-        """Convert and send a response."""
-        self._responder.send(response, header.request_id)
+        return not self._closed and is_destroyed(self._service)
 
     def take(self, most: int) -> None:
-        """Take ``most`` times, and only then deliver: the sooner the queue is empty, the better."""
+        """Take ``most`` times and then deliver, so that the queue is emptied soon."""
+        if not self._service.pointer:
+            return
         for request, header in take_requests(self._take, self._request_type, most):
-            self._deliver(request, header)
+            try:
+                self._deliver(request, header)
+            except Exception as error:
+                # The requests behind it have been taken already.
+                _report(self._signals.loop, self._deliver, error)
 
     def stop(self) -> None:
-        """Deliver no more requests; idempotent."""
+        """Stop delivering requests; idempotent."""
         if not self._stopped:
             self._stopped = True
             self._rcl.signal_requests(self._service, None)
@@ -294,11 +361,11 @@ class DirectService:
 
 
 def _take_responses(signal: Signal[DirectClient], left: int) -> None:
-    """Take as many responses as were signalled, by the client that asked last first.
+    """Take as many responses as were signalled, from the client that sent last first.
 
-    Usually each of them belongs to a client that waits for it. Where some are left over, they were
-    for other processes, and stand in any of the clients' queues: those that wait are drained, the
-    others taken off the signal.
+    Usually each of them belongs to a client that waits for it. Those left over were for other
+    processes, and may stand in the queue of any client: the clients that wait are drained, and the
+    others stop signalling.
     """
     for client in reversed(tuple(signal.waiting)):
         left -= client.take(left)
@@ -315,5 +382,9 @@ def _take_requests(signal: Signal[DirectService], signalled: int) -> None:
         service.take(signalled)
 
 
+def _report(loop: asyncio.AbstractEventLoop, callback: object, error: Exception) -> None:
+    loop.call_exception_handler({"message": f"{callback!r} failed", "exception": error})
+
+
 def _nothing(request: object, response: object) -> None:
-    """Is never called: no executor takes from a service of the group `DirectCallbackGroup`."""
+    """Do nothing: no executor takes from a service of the group `DirectCallbackGroup`."""

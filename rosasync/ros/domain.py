@@ -1,4 +1,4 @@
-"""A ROS domain of one's own, for tests, benchmarks and the demo."""
+"""A ROS domain for this process alone, for tests, benchmarks and the demo."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ _claimed: list[int] = []
 
 
 def isolate() -> int:
-    """Put this process, and the children it starts, into a ROS domain nobody else here uses.
+    """Put this process and its children into a ROS domain that no other process here claims.
 
     Claims a domain by a lock on a file in the temporary directory, held until the process ends,
     and sets ``ROS_DOMAIN_ID`` and ``ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST`` in ``os.environ``.
-    To be called before a context is made.
+    Call it before a context is created.
 
     Returns:
-        The domain id, 1 to 101: those are safe on Linux, where higher ones meet ephemeral ports
+        The domain id, 1 to 101. Higher ones collide with ephemeral ports on Linux
         (https://docs.ros.org/en/jazzy/Concepts/Intermediate/About-Domain-ID.html).
 
     Raises:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import functools
 import itertools
-import weakref
 from collections.abc import Callable
 from typing import Any
 
@@ -13,19 +12,21 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallb
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 
-from rosasync.errors import SessionClosed
+from rosasync.errors import RosasyncError, SessionClosed
 from rosasync.gateway import LoopGateway
 from rosasync.ports import Deliver, DeliverRequest, RequestHeader
-from rosasync.ros.services import Responder, make_service, qos_of
+from rosasync.ros.failures import RclpyError, explain, is_destroyed
+from rosasync.ros.responder import Responder
+from rosasync.ros.services import make_service, qos_of, take_request
 
 __all__ = ["ExecutorBridge"]
 
 BATCH = 100
-"""Most requests that the executor's thread takes at once."""
+"""Requests that the executor's thread takes at once, at the most."""
 
 
 class ExecutorBridge:
-    """Has the executor take responses and requests, and brings them to the loop by a mailbox."""
+    """Has the executor take responses and requests, and passes them to the loop by a gateway."""
 
     name = "executor"
     destroy_delay = 0.0
@@ -34,128 +35,182 @@ class ExecutorBridge:
         self._node = node
         self._configure = configure
         self._gateway = gateway
-        # A group of their own, so that no other callback of the node holds the clients back.
+        # A group for the clients alone, so that no other callback of the node delays them.
         self._group = ReentrantCallbackGroup()
-        self._services: weakref.WeakSet[ExecutorService] = weakref.WeakSet()
+        self._clients: dict[ExecutorClient, None] = {}
+        self._services: dict[ExecutorService, None] = {}
 
     def open_client(
         self, srv_type: Any, srv_name: str, qos: Any, deliver: Deliver
     ) -> ExecutorClient:
-        """Make a client whose responses go to ``deliver``, on the loop's thread."""
+        """Create a client that passes its responses to ``deliver`` on the loop's thread."""
         client = self._node.create_client(
             srv_type, srv_name, qos_profile=qos, callback_group=self._group
         )
-        self._configure(client)
-        return ExecutorClient(self._node, client, self._gateway, deliver)
+        try:
+            self._configure(client)
+        except BaseException:
+            self._node.destroy_client(client)
+            raise
+        opened = ExecutorClient(self._node, client, self._gateway, deliver, self._clients.pop)
+        self._clients[opened] = None
+        return opened
 
     def open_service(
         self, srv_type: Any, srv_name: str, qos: Any, deliver: DeliverRequest
     ) -> ExecutorService:
-        """Make a service whose requests go to ``deliver``, on the loop's thread."""
-        service = ExecutorService(self._node, self._gateway, deliver)
-        service.open(srv_type, srv_name, qos, self._configure)
-        self._services.add(service)
-        return service
+        """Create a service that passes its requests to ``deliver`` on the loop's thread."""
+        # One request at a time, so that they keep their order in a MultiThreadedExecutor.
+        group = GatedCallbackGroup()
+        service = make_service(self._node, srv_type, srv_name, _request, qos, group)
+        try:
+            self._configure(service)
+            opened = ExecutorService(
+                self._node, service, self._gateway, deliver, self._services.pop
+            )
+        except BaseException:
+            self._node.destroy_service(service)
+            raise
+        self._services[opened] = None
+        group.open = True
+        if self._node.executor is not None:
+            self._node.executor.wake()
+        return opened
+
+    def refuse(self) -> None:
+        """Have every later send fail, after the context was shut down.
+
+        rcl sends requests even then, and their responses do not arrive.
+        """
+        for client in self._clients:
+            client.refuse()
 
     def close(self) -> None:
-        """Destroy the services that are left; nothing else is held."""
+        """Destroy the clients and services that are left."""
+        for client in tuple(self._clients):
+            client.close()
         for service in tuple(self._services):
             service.close()
 
 
 class ExecutorClient:
-    """A rclpy client whose futures complete in the executor's thread."""
+    """An rclpy client whose futures complete in the executor's thread."""
 
-    def __init__(self, node: Node, client: Any, gateway: LoopGateway, deliver: Deliver) -> None:
+    def __init__(
+        self,
+        node: Node,
+        client: Any,
+        gateway: LoopGateway,
+        deliver: Deliver,
+        on_close: Callable[[ExecutorClient], object],
+    ) -> None:
         self._node = node
         self._client = client
         self._gateway = gateway
         self._deliver = deliver
+        self._on_close = on_close
+        self._closed = False
         self.handle = client.handle
-        self.ready = client.service_is_ready
+        self._call_async = client.call_async
         self._numbers = itertools.count(1)
-        self._out: dict[int, Any] = {}
+        self._pending: dict[int, Any] = {}
 
     def send(self, request: Any) -> int:
-        """Send a request; a number for it, which grows with every send."""
+        """Send a request and return a number for it; see `rosasync.ports.ClientPort`."""
         number = next(self._numbers)
-        future = self._client.call_async(request)
-        self._out[number] = future
+        try:
+            future = self._call_async(request)
+        except RclpyError as error:
+            raise self._failure(error) from error
+        self._pending[number] = future
         future.add_done_callback(functools.partial(self._complete, number))
         return number
 
-    def forget(self, number: int) -> None:
-        """Expect no response to this request any more."""
-        future = self._out.pop(number, None)
+    def ready(self) -> bool:
+        """Return whether a server is matched; see `rosasync.ports.ClientPort`."""
+        try:
+            return bool(self._client.service_is_ready())
+        except RclpyError as error:
+            raise self._failure(error) from error
+
+    def forget(self, sequence_number: int) -> None:
+        """Stop expecting a response to this request."""
+        future = self._pending.pop(sequence_number, None)
         if future is not None:
             self._client.remove_pending_request(future)
 
+    def refuse(self) -> None:
+        """Have every later send fail."""
+        self._call_async = self._refuse_request
+
     def close(self) -> None:
         """Destroy the rclpy client; idempotent."""
-        for number in tuple(self._out):
+        if self._closed:
+            return
+        self._closed = True
+        for number in tuple(self._pending):
             self.forget(number)
+        self._on_close(self)
         self._node.destroy_client(self._client)
 
     def _complete(self, number: int, future: Any) -> None:
         """Take a completed future's response to the loop. Called on the executor's thread."""
         if not future.cancelled():
-            # After the close there is nobody to be told.
-            with contextlib.suppress(SessionClosed):
-                self._gateway.post(self._arrived, number, future)
+            self._gateway.post_if_open(self._arrived, number, future)
 
     def _arrived(self, number: int, future: Any) -> None:
-        if self._out.pop(number, None) is not None:
+        if self._pending.pop(number, None) is not None:
             self._deliver(number, future.result())
+
+    def _refuse_request(self, request: Any) -> Any:
+        raise self._failure(RosasyncError("the context was shut down"))
+
+    def _failure(self, error: Exception) -> Exception:
+        return explain(self._node, self.handle, error)
 
 
 class ExecutorService:
-    """A rclpy service whose requests the executor takes, and whose responses are ours to send.
+    """An rclpy service whose requests the executor takes, and whose responses are sent later.
 
     The executor calls ``callback(request, response)`` and then
     ``service.send_response(returned, header)``. So the callback returns the request, and
     ``send_response``, replaced on this one service, takes it and its header to the loop. The
-    executor goes on at once, whenever the response will be sent.
+    executor continues at once, whenever the response is sent.
     """
 
     destroy_delay = 0.0
 
-    def __init__(self, node: Node, gateway: LoopGateway, deliver: DeliverRequest) -> None:
+    def __init__(
+        self,
+        node: Node,
+        service: Any,
+        gateway: LoopGateway,
+        deliver: DeliverRequest,
+        on_close: Callable[[ExecutorService], object],
+    ) -> None:
         self._node = node
         self._gateway = gateway
         self._deliver = deliver
-        # One at a time, so that requests keep their order in a MultiThreadedExecutor.
-        self._group = GatedCallbackGroup()
+        self._on_close = on_close
         self._stopped = False
         self._closed = False
-
-    def open(
-        self, srv_type: Any, srv_name: str, qos: Any, configure: Callable[[Any], None]
-    ) -> None:
-        """Create the service, and only then let an executor take from it."""
-        service = make_service(self._node, srv_type, srv_name, _request, qos, self._group)
-        configure(service)
         self.handle = service
         self.qos = qos_of(service)
-        self._request_type = srv_type.Request
-        self._take = service.handle.service_take_request
-        self._responder = Responder(self._node, service)
+        self._service = service.handle
+        self._request_type = service.srv_type.Request
+        self._take = self._service.service_take_request
+        self._responder = Responder(node, service, self.qos)
+        self.send: Callable[[RequestHeader, Any], None] = self._responder.send
         self.has_clients = self._responder.has_clients
         service.send_response = self._taken
-        self._group.shut = False
-        if self._node.executor is not None:
-            self._node.executor.wake()
 
     @property
     def destroyed(self) -> bool:
         """Whether something else than rosasync has destroyed the service."""
-        return self._responder.destroyed
-
-    def send(self, header: RequestHeader, response: Any) -> None:
-        """Convert and send a response."""
-        self._responder.send(response, header.request_id)
+        return not self._closed and is_destroyed(self._service)
 
     def stop(self) -> None:
-        """Deliver no more requests; idempotent."""
+        """Stop delivering requests; idempotent."""
         self._stopped = True
 
     def close(self) -> None:
@@ -163,21 +218,22 @@ class ExecutorService:
         self._stopped = True
         if not self._closed:
             self._closed = True
+            self._on_close(self)
             self._node.destroy_service(self.handle)
 
     def _taken(self, request: Any, header: Any) -> None:
-        """Take this request to the loop, and those behind it. Called on the executor's thread.
+        """Take this request and those behind it to the loop. Called on the executor's thread.
 
         An executor that waits again before every request is too slow for its queue.
         """
         with contextlib.suppress(SessionClosed, InvalidHandle):
             self._gateway.post(self._arrived, request, header)
-            with self.handle.handle:
+            with self._service:
                 for _ in range(BATCH):
-                    request, header = self._take(self._request_type)
-                    if header is None:
+                    pair = take_request(self._take, self._request_type)
+                    if pair is None:
                         break
-                    self._gateway.post(self._arrived, request, header)
+                    self._gateway.post(self._arrived, *pair)
 
     def _arrived(self, request: Any, header: Any) -> None:
         if not self._stopped:
@@ -187,11 +243,11 @@ class ExecutorService:
 class GatedCallbackGroup(MutuallyExclusiveCallbackGroup):  # type: ignore[misc]
     """Keeps its service from every executor until it is opened."""
 
-    shut = True
+    open = False
 
     def can_execute(self, entity: Any) -> bool:
-        """Tell whether an executor may take from the service now."""
-        return not self.shut and bool(super().can_execute(entity))
+        """Return whether an executor may take from the service now."""
+        return self.open and bool(super().can_execute(entity))
 
 
 def _request(request: Any, response: object) -> Any:

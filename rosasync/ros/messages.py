@@ -1,11 +1,11 @@
 """ROS types by their names, and messages from and to plain Python values.
 
 The setters of generated messages check nothing unless ``ROS_PYTHON_CHECK_FIELDS=1`` is set, and
-what they let pass is read as garbage further down: an int in a float field, ``numpy.True_``, a
-fixed array that is too short. So what comes from a mapping is checked here, before it is sent.
+the serialisation turns wrong values into garbage: an int in a float field, ``numpy.True_``, a fixed
+array that is too short. So the values of a mapping are checked here, before they are sent.
 
-Nothing of ROS is imported before the first message type is looked at. Every function may be
-called from any thread.
+ROS packages are imported when their first message type is used. Every function may be called from
+any thread.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ __all__ = [
 
 
 def service_type(srv_type: type[Any] | str) -> type[Any]:
-    """Return the service class that is meant.
+    """Resolve a service class from a class or a name.
 
     Args:
         srv_type: a service class, or its name, ``"std_srvs/srv/SetBool"``.
 
     Raises:
         TypeError: neither a service class nor a string.
-        ValueError: a name that is malformed, or of nothing that is installed.
+        ValueError: the name is malformed, or no such service is installed.
     """
     if isinstance(srv_type, str):
         return _service_named(srv_type)
@@ -61,7 +61,7 @@ def type_name(srv_type: type[Any]) -> str:
     """Return the name of a service, request, response or message class as ROS writes it.
 
     ``"std_srvs/srv/SetBool"``, ``"std_srvs/srv/SetBool_Request"``, ``"geometry_msgs/msg/Pose"``.
-    The name of a class that is not from ROS is the one Python has for it.
+    A class that is not from ROS has its Python name.
     """
     package, *inner = srv_type.__module__.split(".")
     if inner and inner[0] in ("msg", "srv", "action"):
@@ -80,8 +80,8 @@ def request_message(srv_type: type[Any], request: object) -> Any:
             `to_message`; or None for an empty one.
 
     Raises:
-        TypeError: anything else; or a field's value of the wrong kind.
-        ValueError: no such field; or a value out of its range.
+        TypeError: the request is anything else, or a field's value is of the wrong kind.
+        ValueError: no such field, or a value out of its range.
     """
     expected = srv_type.Request
     return request if isinstance(request, expected) else _as_message(expected, request)
@@ -94,7 +94,7 @@ def response_message(srv_type: type[Any], response: object) -> Any:
 
 
 def to_message(message_type: type[Any], fields: Mapping[str, Any]) -> Any:
-    """Make a message from a mapping of its fields; those left out keep their defaults.
+    """Create a message from a mapping of its fields; fields left out keep their defaults.
 
     ==================  ===========================================================================
     field               takes
@@ -125,10 +125,10 @@ def to_message(message_type: type[Any], fields: Mapping[str, Any]) -> Any:
 
 
 def to_dict(message: object) -> dict[str, Any]:
-    """Return the fields of a message as plain Python values, which `to_message` takes again.
+    """Return the fields of a message as plain Python values, which `to_message` accepts.
 
-    Nested messages become dicts, arrays and sequences lists, those of uint8 and byte become bytes.
-    A single byte stays bytes of length 1, as the constants of its type are.
+    Nested messages become dicts, and arrays and sequences become lists, but those of uint8 and
+    byte become bytes. A single byte stays bytes of length 1, like the constants of its type.
 
     Raises:
         TypeError: not a message.
@@ -148,7 +148,7 @@ def _as_message(expected: type[Any], value: object) -> Any:
 
 
 def _given(value: object) -> str:
-    """Say what was passed, for an error: the type, and the value where it is short."""
+    """Describe a value for an error: by its type, and by the value itself if it is a scalar."""
     if value is None:
         return "None"
     if isinstance(value, type):
@@ -212,7 +212,7 @@ def _hint(similar: Sequence[str], all_names: Iterable[str]) -> str:
 
 
 class _InvalidField(Exception):
-    """A value that a field cannot take; collects the path on its way out."""
+    """A value that a field cannot take. The path is collected while it propagates."""
 
     def __init__(self, kind: type[Exception], problem: str) -> None:
         self.kind = kind
@@ -314,7 +314,7 @@ class _Float(_Field):
 
 
 class _Octet(_Field):
-    """A byte, which rclpy has as bytes of length 1."""
+    """A byte, which rclpy represents as bytes of length 1."""
 
     def to_ros(self, value: object) -> bytes:
         if isinstance(value, bytes | bytearray):
@@ -327,7 +327,7 @@ class _Octet(_Field):
 
 
 class _Character(_Field):
-    """A ``char`` of an IDL file; that of a .msg file is a uint8."""
+    """A ``char`` of an IDL file. In a .msg file, ``char`` is a uint8."""
 
     def to_ros(self, value: object) -> str:
         if not isinstance(value, str):
@@ -348,7 +348,7 @@ class _Text(_Field):
         if not isinstance(value, str):
             raise self.refuse(value)
         if not self.wide and "\0" in value:
-            # rosidl copies up to there and drops the rest without a word.
+            # rosidl copies up to there and silently drops the rest.
             raise _InvalidField(ValueError, f"a ROS string ends at NUL, and {value!r} has one")
         size = self._size(value)
         if self.bound is not None and size > self.bound:
@@ -384,7 +384,7 @@ class _Nested(_Field):
 
 
 class _Sequence(_Field):
-    """An array (as many elements at least as at most), or a sequence (bounded or not)."""
+    """An array, of which ``least`` equals ``most``, or a sequence, bounded or not."""
 
     def __init__(self, element: _Field, least: int, most: int | None) -> None:
         size = "" if most is None else f"{most}" if least else f"<={most}"
@@ -426,7 +426,7 @@ class _Sequence(_Field):
 
 
 class _Numbers(_Sequence):
-    """Numbers, which rclpy has as an ``array.array``, or a NumPy array where the size is fixed."""
+    """Numbers, in rclpy an ``array.array``, or a NumPy array if the size is fixed."""
 
     def __init__(self, element: _Integer | _Float, least: int, most: int | None) -> None:
         super().__init__(element, least, most)
@@ -452,7 +452,7 @@ class _Bytes(_Numbers):
 
 
 class _Octets(_Sequence):
-    """Bytes, which rclpy has as a list of bytes of length 1."""
+    """Bytes, which rclpy represents as a list of bytes of length 1."""
 
     def to_ros(self, value: object) -> Any:
         packed = _buffer(value, ("B",))
@@ -466,14 +466,14 @@ class _Octets(_Sequence):
 
 
 def _formats_like(typecode: str) -> tuple[str, ...]:
-    """Return the codes of the same kind and size: a C long is as good as an int64."""
+    """Return the codes of the same kind and size, such as a C long for an int64."""
     size = struct.calcsize(typecode)
     kind = next(codes for codes in ("bhilq", "BHILQ", "fd") if typecode in codes)
     return tuple(code for code in kind if struct.calcsize(code) == size)
 
 
 def _buffer(value: Any, formats: tuple[str, ...]) -> memoryview | None:
-    """Return a view of what already has the right layout, so that no element need be checked."""
+    """Return a view if the layout is right already, so that no element has to be checked."""
     try:
         view = memoryview(value)
     except (TypeError, ValueError):  # ValueError: a NumPy array of dates, a released view
@@ -538,12 +538,12 @@ def _fields(message_type: type[Any]) -> dict[str, _Field]:
 
 
 def _field(slot: Any, default: object = None) -> _Field:
-    """Return the field for a type as rosidl_parser defines it, and the default it has."""
+    """Return the field for a type of rosidl_parser and the default value of that field."""
     idl: Any = importlib.import_module("rosidl_parser.definition")
     if isinstance(slot, idl.AbstractNestedType):
         return _sequence(slot, _field(slot.value_type))
     if isinstance(slot, idl.NamespacedType):
-        # By its default where there is one: the goal of an action is not where its name says.
+        # From the default if there is one: the module of an action goal is not the one in its name.
         return _Nested(type(default) if default is not None else _imported(slot))
     if isinstance(slot, idl.AbstractGenericString):
         bound = slot.maximum_size if slot.has_maximum_size() else None

@@ -12,13 +12,13 @@ __all__ = ["Rcl", "load"]
 
 
 class Rcl:
-    """librcl, and the libc function that stands in as its callback.
+    """librcl, and the libc function used as its callback.
 
     ``rcl_event_callback_t`` is ``void (*)(const void * user_data, size_t number_of_events)``
     (rcl/event_callback.h). libc's ``int eventfd_write(int fd, eventfd_t value)`` fits that shape
-    where a pointer, ``size_t`` and ``eventfd_t`` are passed in the same registers and an ``int``
-    is the low half of one: on x86-64 and aarch64. So the middleware's own thread signals an
-    eventfd, with no Python and no GIL in it (a Python callback there can deadlock: rclpy issue
+    if a pointer, ``size_t`` and ``eventfd_t`` are passed in the same registers and an ``int`` is
+    the low half of one, as on x86-64 and aarch64. So the middleware's own thread signals an
+    eventfd without Python and without the GIL (a Python callback there can deadlock: rclpy issue
     1722).
     """
 
@@ -37,18 +37,26 @@ class Rcl:
         self._add_guard.argtypes = [*pointers[:2], ctypes.POINTER(ctypes.c_size_t)]
 
     def signal_responses(self, client: Any, fd: int | None) -> bool:
-        """Have an eventfd count the client's new responses; None ends it. False: unsupported."""
+        """Have an eventfd count the client's new responses; None ends it.
+
+        Returns:
+            False if the middleware does not support it or the client was destroyed.
+        """
         return _set_callback(self._on_response, client, self._signal, fd)
 
     def signal_requests(self, service: Any, fd: int | None) -> bool:
-        """Have an eventfd count the service's new requests; None ends it. False: unsupported."""
+        """Have an eventfd count the service's new requests; None ends it.
+
+        Returns:
+            False if the middleware does not support it or the service was destroyed.
+        """
         return _set_callback(self._on_request, service, self._signal, fd)
 
     def add_graph_guard(self, node: Any, wait_set: Any) -> int | None:
         """Add the node's graph guard condition to a wait set.
 
         Returns:
-            Its index there, None where it could not be had.
+            Its index there, or None if there is no such condition.
         """
         guard = self._graph(node.pointer)
         index = ctypes.c_size_t()
@@ -62,14 +70,14 @@ def _set_callback(function: Any, handle: Any, signal: Any, fd: int | None) -> bo
         return False
     if fd is None:
         return bool(function(handle.pointer, None, None) == 0)
-    # rmw_fastrtps counts what has come and only then installs its listener: what comes in between
-    # is neither counted nor told of. The second time it is counted.
+    # rmw_fastrtps counts what has come and then installs its listener: what comes in between is
+    # neither counted nor signalled. The second call counts it.
     return all(function(handle.pointer, signal, ctypes.c_void_p(fd)) == 0 for _ in range(2))
 
 
 @cache
 def load() -> Rcl | None:
-    """Return librcl, or None where the platform has it not, or not in the shape needed."""
+    """Return librcl, or None if this platform does not support it."""
     if sys.platform != "linux" or platform.machine() not in ("x86_64", "aarch64"):
         return None
     if sys.maxsize < 2**32:

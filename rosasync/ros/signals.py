@@ -12,24 +12,28 @@ __all__ = ["Signal", "Signals"]
 M = TypeVar("M")
 
 MOST = 16
-"""Most eventfds of a kind: enough to tell members apart, few enough to have always."""
+"""Eventfds of a kind at the most: enough to tell members apart, without using up descriptors."""
 
 
 class Signal(Generic[M]):
-    """An eventfd, who shares it, and who of them waits for something."""
+    """An eventfd, the members that share it, and those of them that wait for something."""
 
     def __init__(
         self, loop: asyncio.AbstractEventLoop, take: Callable[[Signal[M], int], None]
     ) -> None:
         self._loop = loop
         self._take = take
-        self.fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self.members: dict[M, None] = {}
         self.waiting: dict[M, None] = {}
-        loop.add_reader(self.fd, self._on_readable)
+        self.fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        try:
+            loop.add_reader(self.fd, self._on_readable)
+        except BaseException:
+            os.close(self.fd)
+            raise
 
     def close(self) -> None:
-        """Close the eventfd; nobody may write to it any more."""
+        """Close the eventfd, when the middleware does not write to it any more."""
         if not self._loop.is_closed():
             self._loop.remove_reader(self.fd)
         os.close(self.fd)
@@ -45,18 +49,18 @@ class Signal(Generic[M]):
 class Signals(Generic[M]):
     """Gives each member a signal to share with as few others as possible.
 
-    The first signal stays until the end, so that the number of descriptors depends on how many
+    The first signal stays until `close`, so that the number of descriptors depends on how many
     members there are, not on how many there have been.
 
     Args:
         loop: the loop that watches.
-        take: called on its thread with a signal and how many events the middleware counted.
+        take: called on its thread with a signal and the number of events.
     """
 
     def __init__(
         self, loop: asyncio.AbstractEventLoop, take: Callable[[Signal[M], int], None]
     ) -> None:
-        self._loop = loop
+        self.loop = loop
         self._take = take
         self._signals: list[Signal[M]] = []
 
@@ -66,16 +70,30 @@ class Signals(Generic[M]):
         return [member for signal in self._signals for member in signal.members]
 
     def join(self, member: M) -> Signal[M]:
-        """Return the signal for a new member."""
+        """Return the signal for a new member.
+
+        Raises:
+            OSError: the process is out of file descriptors and there is no signal to share.
+        """
         signal = min(self._signals, key=lambda signal: len(signal.members), default=None)
         if signal is None or (signal.members and len(self._signals) < MOST):
-            signal = Signal(self._loop, self._take)
-            self._signals.append(signal)
+            signal = self._add(signal)
         signal.members[member] = None
         return signal
 
+    def _add(self, shared: Signal[M] | None) -> Signal[M]:
+        """Return a new signal, or ``shared`` if the process is out of file descriptors."""
+        try:
+            signal = Signal(self.loop, self._take)
+        except OSError:
+            if shared is None:
+                raise
+            return shared
+        self._signals.append(signal)
+        return signal
+
     def leave(self, member: M, signal: Signal[M]) -> None:
-        """Let go of a member that the middleware signals nothing for any more; idempotent."""
+        """Remove a member for which the middleware does not signal any more; idempotent."""
         signal.members.pop(member, None)
         signal.waiting.pop(member, None)
         if not signal.members and len(self._signals) > 1 and signal in self._signals:
@@ -83,7 +101,7 @@ class Signals(Generic[M]):
             signal.close()
 
     def close(self) -> None:
-        """Close the eventfds; after the members left."""
+        """Close the eventfds, after the members have left."""
         for signal in self._signals:
             signal.close()
         self._signals.clear()

@@ -1,0 +1,54 @@
+"""Service names, types and QoS: checked, resolved, and with their defaults."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rclpy.exceptions import InvalidServiceNameException, InvalidTopicNameException
+from rclpy.expand_topic_name import expand_topic_name
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, qos_profile_services_default
+from rclpy.validate_full_topic_name import validate_full_topic_name
+
+from rosasync.errors import InvalidServiceName
+from rosasync.ports import Service
+from rosasync.ros.failures import uses_node
+from rosasync.ros.messages import service_type, type_name
+from rosasync.statistics import ServiceKey
+
+__all__ = ["default_qos", "describe"]
+
+DEPTH = 1000
+"""History of the default QoS. With rclpy's ten, requests and responses get lost."""
+
+
+def describe(node: Node, srv_type: Any, srv_name: str, qos: Any) -> Service:
+    """Check and resolve a service; see `rosasync.ports.NodePort.describe`."""
+    if qos is not None and not isinstance(qos, QoSProfile):
+        raise TypeError(f"qos must be an rclpy QoSProfile, not {type(qos).__name__}")
+    srv_class = service_type(srv_type)
+    qos_key = None if qos is None else str(qos)
+    key = ServiceKey(_resolve(node, srv_name), type_name(srv_class), qos_key)
+    return Service(srv_class, srv_name, qos, key)
+
+
+def default_qos() -> QoSProfile:
+    """Return the service default with a history of 1,000."""
+    qos = QoSProfile(depth=DEPTH)
+    for name in ("history", "reliability", "durability"):
+        setattr(qos, name, getattr(qos_profile_services_default, name))
+    return qos
+
+
+def _resolve(node: Node, srv_name: str) -> str:
+    """Return the expanded and remapped name."""
+    if not isinstance(srv_name, str):
+        raise TypeError(f"a service name must be a str, not {type(srv_name).__name__}")
+    try:
+        with uses_node(node):
+            name = expand_topic_name(srv_name, node.get_name(), node.get_namespace())
+            validate_full_topic_name(name, is_service=True)
+            return str(node.resolve_service_name(srv_name))
+    except (InvalidServiceNameException, InvalidTopicNameException, ValueError) as error:
+        reason = str(error).strip().replace("\n", " ")
+        raise InvalidServiceName(f"{srv_name!r} is not a valid service name: {reason}") from None

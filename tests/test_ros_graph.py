@@ -1,0 +1,266 @@
+"""The graph as a node sees it: servers that fit, what is there instead, and who is informed."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import AsyncIterator
+from typing import Any
+
+import pytest
+from diagnostic_msgs.srv import AddDiagnostics
+from rclpy.duration import Duration
+from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
+from std_srvs.srv import Trigger
+
+from rosasync.errors import UsageError
+from rosasync.ros import endpoints, graph, node
+from rosasync.ros.endpoints import gid_of, incompatibility, response_writers
+from rosasync.ros.graph import GraphQueries, GraphWaitable
+from tests.conftest import Bridge
+from tests.support.nodes import Opened, borrowed_node, open_node
+from tests.support.times import until
+
+BEST_EFFORT = QoSProfile(depth=10, reliability=QoSReliabilityPolicy.BEST_EFFORT)
+TRANSIENT = QoSProfile(depth=10, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
+DEADLINE = QoSProfile(depth=10, deadline=Duration(seconds=1))
+
+
+@pytest.fixture
+async def opened() -> AsyncIterator[Opened]:
+    async with open_node("direct") as opened:
+        yield opened
+
+
+def nothing(request: Any, response: Any) -> Any:
+    return response
+
+
+class TestServers:
+    """Which servers count."""
+
+    async def test_they_are_told_apart_by_their_response_writers(self, opened: Opened) -> None:
+        service = opened.service()
+        assert opened.ros.find_servers(service) == frozenset()
+        with borrowed_node() as lender:
+            servers = [lender.create_service(AddDiagnostics, "/echo", nothing) for _ in range(2)]
+            await until(lambda: len(opened.ros.find_servers(service)) == 2)
+            gids = {gid_of(writer) for writer in response_writers(lender, "/echo")}
+            assert opened.ros.find_servers(service) == gids
+            lender.destroy_service(servers[0])
+            await until(lambda: len(opened.ros.find_servers(service)) == 1)
+            assert opened.ros.find_servers(service) < gids
+
+    async def test_those_of_another_type_do_not_count(self, opened: Opened) -> None:
+        with borrowed_node() as lender:
+            lender.create_service(Trigger, "/echo", nothing)
+            await until(lambda: opened.ros.node.count_services("/echo"))
+            assert opened.ros.find_servers(opened.service(srv_type=Trigger))
+            assert not opened.ros.find_servers(opened.service())
+
+    @pytest.mark.parametrize(
+        ("served", "asked", "fits"),
+        [
+            (None, None, True),
+            (QoSProfile(depth=1), None, True),
+            (BEST_EFFORT, None, False),
+            (None, BEST_EFFORT, False),
+            (BEST_EFFORT, BEST_EFFORT, True),
+            (TRANSIENT, None, False),
+            (None, TRANSIENT, False),
+            (TRANSIENT, TRANSIENT, True),
+            (DEADLINE, None, False),
+            (DEADLINE, DEADLINE, True),
+        ],
+    )
+    async def test_those_of_another_qos_do_not_count(
+        self, opened: Opened, served: Any, asked: Any, fits: bool
+    ) -> None:
+        """As the middleware decides: a client is matched if, and only if, a server fits."""
+        with borrowed_node() as lender:
+            options = {} if served is None else {"qos_profile": served}
+            lender.create_service(AddDiagnostics, "/echo", nothing, **options)
+            await until(lambda: opened.ros.node.count_services("/echo"))
+            assert bool(opened.ros.find_servers(opened.service(qos=asked))) == fits
+            client = opened.client(qos=asked)
+            lender.create_service(AddDiagnostics, "/witness", nothing)
+            await until(opened.client("/witness").ready)
+            assert client.ready() == fits
+
+    async def test_placeholders_if_the_topics_have_other_names(
+        self, opened: Opened, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(graph, "response_writers", lambda *_: [])
+        with borrowed_node() as lender:
+            for _ in range(2):
+                lender.create_service(AddDiagnostics, "/echo", nothing)
+            await until(lambda: opened.ros.node.count_services("/echo") == 2)
+            assert opened.ros.find_servers(opened.service()) == {0, 1}
+            assert not opened.ros.find_servers(opened.service(srv_type=Trigger))
+
+    def test_unset_values_are_not_incompatible(self) -> None:
+        assert incompatibility(QoSProfile(depth=10), QoSProfile(depth=1)) is None
+        assert "best effort" in str(incompatibility(BEST_EFFORT, QoSProfile(depth=10))).lower()
+        assert endpoints.compatible(TRANSIENT, QoSProfile(depth=10))
+        assert not endpoints.compatible(QoSProfile(depth=10), TRANSIENT)
+
+
+class TestMissing:
+    """What is said of a service that is not there."""
+
+    @pytest.mark.parametrize("events", [True, False])
+    async def test_many_callers_share_one_snapshot(
+        self, opened: Opened, monkeypatch: pytest.MonkeyPatch, events: bool
+    ) -> None:
+        now = 100.0
+        monkeypatch.setattr(graph, "monotonic", lambda: now)
+        with borrowed_node() as lender:
+            for number in range(20):
+                lender.create_service(Trigger, f"/service_{number}", nothing)
+            await until(lambda: opened.ros.node.count_services("/service_19"))
+            queries = GraphQueries(opened.ros.node, events)
+            counted = 0
+            list_services = opened.ros.node.get_service_names_and_types
+
+            def counting() -> Any:
+                nonlocal counted
+                counted += 1
+                return list_services()
+
+            monkeypatch.setattr(opened.ros.node, "get_service_names_and_types", counting)
+            service = opened.service("/missing")
+            for _ in range(100):
+                queries.explain_missing(service)
+            assert counted == 1
+            now += graph.SNAPSHOT_TIME
+            queries.explain_missing(service)
+            assert counted == (1 if events else 2)
+            queries.changed()
+            queries.explain_missing(service)
+            assert counted == (2 if events else 3)
+
+    async def test_a_change_of_the_graph_is_in_the_next_answer(self, opened: Opened) -> None:
+        missing = opened.service("/ecco")
+        opened.ros.explain_missing(missing)
+        with borrowed_node() as lender:
+            lender.create_service(AddDiagnostics, "/echo", nothing)
+            await until(lambda: "/echo" in opened.ros.explain_missing(missing))
+
+    async def test_only_services_of_its_own(self, opened: Opened) -> None:
+        missing = opened.service("/ecco")
+        assert "no other node's services are visible" in opened.ros.explain_missing(missing)
+        opened.serve("/own")
+        await until(lambda: opened.ros.node.count_services("/own"))
+        assert "no other node's services are visible" in opened.ros.explain_missing(missing)
+        with borrowed_node() as lender:
+            lender.create_service(Trigger, "/far", nothing)
+            await until(
+                lambda: (
+                    "among" in opened.ros.explain_missing(opened.service("/zzz", Trigger))
+                    or "/far" in opened.ros.explain_missing(opened.service("/zzz", Trigger))
+                )
+            )
+
+    async def test_the_type_and_the_qos(self, opened: Opened) -> None:
+        with borrowed_node() as lender:
+            lender.create_service(Trigger, "/echo", nothing)
+            await until(lambda: opened.ros.node.count_services("/echo"))
+            assert "served as std_srvs/srv/Trigger" in opened.ros.explain_missing(opened.service())
+            service = opened.service(srv_type=Trigger, qos=BEST_EFFORT)
+            assert "compare the QoS" in opened.ros.explain_missing(service)
+
+
+class TestEvents:
+    """Every node of a context hears of every change, though one wait set takes the event."""
+
+    async def test_nodes_come_and_go_in_other_threads(self) -> None:
+        """The waitable that tells the others tells all of them, in an order of its own."""
+        stop = threading.Event()
+        errors: list[Exception] = []
+
+        class Lender:
+            """Enough of a node for a waitable."""
+
+            def __init__(self) -> None:
+                self.context = self
+                self.waitables: list[Any] = []
+                self.add_waitable = self.waitables.append
+                self.remove_waitable = self.waitables.remove
+
+        lender = Lender()
+
+        def churn() -> None:
+            while not stop.is_set():
+                made = [GraphWaitable(lender, None, nothing_changed) for _ in range(20)]  # type: ignore[arg-type]
+                for waitable in made:
+                    waitable.close()
+
+        heard = 0
+
+        def changed() -> None:
+            nonlocal heard
+            heard += 1
+
+        def nothing_changed() -> None:
+            """Another session's."""
+
+        kept = GraphWaitable(lender, None, changed)  # type: ignore[arg-type]
+        threads = [threading.Thread(target=churn) for _ in range(2)]
+        for thread in threads:
+            thread.start()
+        rounds = 3000
+        for _ in range(rounds):
+            try:
+                kept.execute(None).send(None)
+            except StopIteration:
+                continue
+            except Exception as error:
+                errors.append(error)
+                break
+        stop.set()
+        for thread in threads:
+            thread.join()
+        assert errors == []
+        assert heard == rounds
+
+    async def test_two_nodes_of_a_context(self, bridge: Bridge) -> None:
+        with borrowed_node() as lender:
+            async with (
+                open_node(bridge, lender) as one,
+                open_node(bridge, "other", context=lender.context) as two,
+            ):
+                with borrowed_node("server") as server:
+                    server.create_service(Trigger, "/new", nothing)
+                    await until(lambda: one.changes and two.changes)
+
+
+class TestExecutors:
+    """Which bridge an executor allows."""
+
+    def test_events_executor_is_recognised(self) -> None:
+        """Its module is not rclpy.experimental; a user may have derived another from it."""
+        from rclpy.impl.implementation_singleton import rclpy_implementation
+
+        events_executor = rclpy_implementation.EventsExecutor
+        assert events_executor.__module__ != "rclpy.experimental"
+
+        kinds: list[Any] = [events_executor, type("Derived", (events_executor,), {})]
+        for kind in kinds:
+            assert node._takes_callbacks(kind.__new__(kind))
+        assert not node._takes_callbacks(None)
+
+    async def test_its_nodes_are_not_taken_from_directly(self) -> None:
+        from rclpy.experimental.events_executor import EventsExecutor
+
+        with borrowed_node() as lender:
+            executor = EventsExecutor(context=lender.context)
+            executor.add_node(lender)
+            async with open_node("auto", lender) as opened:
+                assert opened.ros.bridge == "executor"
+                assert not opened.ros.graph_events
+                assert lender.executor is executor
+            with pytest.raises(UsageError, match="EventsExecutor"):
+                async with open_node("direct", lender):
+                    pass
+            assert lender.executor is executor
+            executor.remove_node(lender)
+            executor.shutdown()
