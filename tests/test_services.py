@@ -20,7 +20,7 @@ from rosasync.ros.responder import (
     Responder,
     client_of,
 )
-from rosasync.server import RESEND
+from rosasync.service_call import RESEND
 from tests.support.times import LIMIT
 
 BLOCKED = 0.1
