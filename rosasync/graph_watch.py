@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterator, ValuesView
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from rosasync.errors import ContextShutdown
 
 if TYPE_CHECKING:
     from rosasync.ports import NodePort
-    from rosasync.service_pool import ServicePool
 
-__all__ = ["GraphWatch"]
+__all__ = ["GraphWatch", "Watcher"]
 
 POLL_MIN = 0.002
 """Seconds until a new client is first polled: matching it with a server takes milliseconds."""
@@ -22,6 +21,25 @@ POLL_MAX = 0.25
 POLL_CONTEXT = 0.5
 """Seconds between two polls of the context while requests are outstanding: rclpy's signal handler
 shuts it down without an event."""
+
+
+class Watcher(Protocol):
+    """A service that depends on the graph."""
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether there are callers, or requests without a caller."""
+
+    @property
+    def awaits_match(self) -> bool:
+        """Whether callers wait for a client to be matched."""
+
+    def on_graph(self) -> None:
+        """Look at the graph again.
+
+        Raises:
+            ContextShutdown: the node is down.
+        """
 
 
 class GraphWatch:
@@ -40,7 +58,7 @@ class GraphWatch:
     def __init__(
         self,
         node: NodePort,
-        services: ValuesView[ServicePool],
+        services: Collection[Watcher],
         on_shutdown: Callable[[], object],
     ) -> None:
         self._loop = asyncio.get_running_loop()

@@ -70,14 +70,13 @@ class HandlerTasks:
         self._closer_added: asyncio.Future[None] | None = None
 
     def __len__(self) -> int:
-        return len(self._tasks - self._closers)
+        return len(self._pending())
 
     def spawn(self, work: Coroutine[Any, Any, None]) -> None:
         """Run a coroutine in a task."""
         task = self._loop.create_task(self._run(work))
         if not task.done():
             self._tasks.add(task)
-            task.add_done_callback(self._done)
 
     def exclude_caller(self) -> None:
         """Do not wait for the handler whose task calls this, or started the task that does."""
@@ -89,7 +88,7 @@ class HandlerTasks:
 
     async def wait(self, deadline: float | None) -> None:
         """Wait until every task is done, or until this time of the loop's."""
-        while tasks := self._tasks - self._closers:
+        while tasks := self._pending():
             left = None if deadline is None else deadline - self._loop.time()
             if left is not None and left <= 0:
                 return
@@ -102,10 +101,14 @@ class HandlerTasks:
 
     def cancel(self) -> None:
         """Cancel every task, in the next turn."""
-        for task in self._tasks - self._closers:
+        for task in self._pending():
             # Not at once: a task that has not begun would end without running its handler's
             # `finally`, or ours.
             self._loop.call_soon(task.cancel)
+
+    def _pending(self) -> set[asyncio.Task[None]]:
+        # A task that is cancelled before it begins, by something else, never leaves the set itself.
+        return {task for task in self._tasks - self._closers if not task.done()}
 
     async def _run(self, work: Coroutine[Any, Any, None]) -> None:
         task = asyncio.current_task()
@@ -115,21 +118,15 @@ class HandlerTasks:
         _handler_task.set(task)
         try:
             await work
+        except (KeyboardInterrupt, SystemExit):
+            # The loop raises them, so the task need not report them once more.
+            task.add_done_callback(asyncio.Task.exception)
+            raise
         finally:
             # The task's own context would keep the task alive.
             _handler_task.set(None)
-            self._forget(task)
-
-    def _done(self, task: asyncio.Task[None]) -> None:
-        self._forget(task)
-        if not task.cancelled():
-            # Marks it as retrieved. It can only be one that the loop has raised already, because it
-            # ends the program.
-            task.exception()
-
-    def _forget(self, task: asyncio.Task[None]) -> None:
-        self._tasks.discard(task)
-        self._closers.discard(task)
+            self._tasks.discard(task)
+            self._closers.discard(task)
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,7 +36,6 @@ async def test_each_future_fails_at_its_own_deadline_in_order() -> None:
     await asyncio.wait(futures, timeout=LIMIT)
     assert all(isinstance(future.exception(), Expired) for future in futures)
     assert ended == sorted(times)
-    assert loop.time() >= max(times) - TICK / 10
 
 
 async def test_one_timer_which_ends_with_the_last_future() -> None:

@@ -36,7 +36,7 @@ def is_destroyed(handle: Any) -> bool:
 def check_up(node: Node) -> None:
     """Raise `ContextShutdown` if the node or its context is down."""
     if not is_up(node):
-        raise _context_shut_down()
+        raise ContextShutdown()
 
 
 def explain(node: Node, handle: Any, error: Exception) -> Exception:
@@ -48,7 +48,7 @@ def explain(node: Node, handle: Any, error: Exception) -> Exception:
         error: what rclpy raised.
     """
     if not is_up(node):
-        return _context_shut_down()
+        return ContextShutdown()
     if is_destroyed(handle):
         return PortDestroyed("the rclpy client or service was destroyed")
     return RosasyncError(f"rclpy failed: {error}")
@@ -73,7 +73,7 @@ def uses_node(node: Node) -> Iterator[None]:
 def refusal(node: Node, service: Service, kind: str, error: Exception) -> Exception:
     """Return the error to raise after rclpy has failed to create a client or service."""
     if not is_up(node):
-        return _context_shut_down()
+        return ContextShutdown()
     srv_name, srv_type, _ = service.key
     if "incompatible type" in str(error):
         return UsageError(
@@ -85,7 +85,3 @@ def refusal(node: Node, service: Service, kind: str, error: Exception) -> Except
         f"{srv_name}: the middleware refused to create the {kind} of type {srv_type}; check the "
         f"name, the QoS and how many entities this process has ({error})"
     )
-
-
-def _context_shut_down() -> ContextShutdown:
-    return ContextShutdown("the rclpy context was shut down, or the node destroyed")
