@@ -53,7 +53,7 @@ async def burst(
     shares = [len(range(number, CLIENTS, PROCESSES)) for number in range(PROCESSES)]
     for process, clients in zip(crowd, shares, strict=True):
         await process.start(name, EACH, clients=clients, in_flight=EACH, timeout=timeout, **options)
-    tallies = [await process.result() for process in crowd]
+    tallies = await asyncio.gather(*(process.result() for process in crowd))
     return {
         "answered": sum(tally.answered for tally in tallies),
         "wrong": sum(tally.wrong for tally in tallies),
@@ -160,7 +160,7 @@ async def test_a_thousand_answers_from_four_threads(
         async with session.serve(ECHO, name, answerers.take) as server:
             for process in crowd:
                 await process.start(name, 50, clients=5, in_flight=EACH, depth=1000)
-            tallies = [await process.result() for process in crowd]
+            tallies = await asyncio.gather(*(process.result() for process in crowd))
             assert tallies == [Tally(answered=250)] * PROCESSES
             await settled(server)
             statistics = server.statistics()
@@ -184,7 +184,7 @@ async def test_the_server_closes_while_four_threads_answer(
     statistics = server.statistics()
     assert statistics.taken == statistics.responded + statistics.dropped
     assert answerers.refused == statistics.dropped
-    tallies = [await process.result() for process in crowd]
+    tallies = await asyncio.gather(*(process.result() for process in crowd))
     assert sum(tally.wrong for tally in tallies) == 0
     # The middleware destroys the server's writer with what it has not delivered: no more than what
     # the clients had in flight.
