@@ -45,7 +45,13 @@ async def in_a_task_of_its_own(closing: Awaitable[object]) -> None:
     await asyncio.gather(closing)
 
 
-WAYS = [in_this_task, in_a_task_of_its_own]
+async def after_a_pause(closing: Awaitable[object]) -> None:
+    """An eager task is only then known to the server."""
+    await asyncio.sleep(0)
+    await closing
+
+
+WAYS = [in_this_task, in_a_task_of_its_own, after_a_pause]
 
 
 @pytest.fixture(params=FACTORIES)
