@@ -9,7 +9,6 @@ import logging
 from collections.abc import Awaitable, Callable, Coroutine
 from contextvars import ContextVar
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Any, Generic, TypeAlias, TypeVar
 
 from rosasync.errors import ContextShutdown, SessionClosed
@@ -183,13 +182,14 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
         self.running += 1
         in_task = False
         try:
-            with _Settling(self, call, self._fail):
-                result = self._kind.invoke(call)
-                if result is not None and inspect.isawaitable(result):
-                    in_task = True
-                    self._tasks.spawn(self._await_handler(call, result))
-                else:
-                    self._finish(call, result)
+            result = self._kind.invoke(call)
+            if result is not None and inspect.isawaitable(result):
+                in_task = True
+                self._tasks.spawn(self._await_handler(call, result))
+            else:
+                self._finish(call, result)
+        except BaseException as error:
+            self._contain(call, error, self._fail)
         finally:
             if not in_task:
                 self.running -= 1
@@ -209,17 +209,19 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
             arguments: what it is called with.
             otherwise: called with the call if the hook has failed or returned None.
         """
-        with _Settling(self, call, self._fail_hook):
+        try:
             result = hook(*arguments)
             if result is not None and inspect.isawaitable(result):
                 self._tasks.spawn(self._await_hook(call, result, otherwise))
                 return
             if result is not None:
                 call.respond(result)
+        except BaseException as error:
+            self._contain(call, error, self._fail_hook)
         if not call.settled:
             otherwise(call)
 
-    def cancelled(self, call: ServiceCall[RequestT, ResponseT]) -> None:
+    def _cancelled(self, call: ServiceCall[RequestT, ResponseT]) -> None:
         """Give up a call whose handler, or hook, was cancelled."""
         call.give_up("given up: its handler was cancelled")
         if not call.responded:
@@ -229,8 +231,9 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
         self, call: ServiceCall[RequestT, ResponseT], pending: Awaitable[Any]
     ) -> None:
         try:
-            with _Settling(self, call, self._fail):
-                self._finish(call, await pending)
+            self._finish(call, await pending)
+        except BaseException as error:
+            self._contain(call, error, self._fail)
         finally:
             self.running -= 1
             self._on_finished()
@@ -241,10 +244,12 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
         pending: Awaitable[Any],
         otherwise: Callable[[ServiceCall[RequestT, ResponseT]], None],
     ) -> None:
-        with _Settling(self, call, self._fail_hook):
+        try:
             result = await pending
             if result is not None:
                 call.respond(result)
+        except BaseException as error:
+            self._contain(call, error, self._fail_hook)
         if not call.settled:
             otherwise(call)
 
@@ -256,6 +261,20 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
             raise TypeError("the handler returned None instead of the response")
         elif not call.settled:
             self._counts.deferred += 1
+
+    def _contain(
+        self,
+        call: ServiceCall[RequestT, ResponseT],
+        error: BaseException,
+        fail: Callable[[ServiceCall[RequestT, ResponseT], Exception], None],
+    ) -> None:
+        """Settle a call whose handler, or hook, has raised; pass on what ends the program."""
+        if isinstance(error, asyncio.CancelledError):
+            self._cancelled(call)
+        elif isinstance(error, Exception):
+            fail(call, error)
+        else:
+            raise error
 
     def _fail(self, call: ServiceCall[RequestT, ResponseT], error: Exception) -> None:
         if self._sender.ending is not None and isinstance(error, SessionClosed | ContextShutdown):
@@ -275,42 +294,6 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
         logger.error(
             "%s: on_error or on_overload failed for %r", self._sender.name, call, exc_info=error
         )
-
-
-class _Settling(Generic[RequestT, ResponseT]):
-    """Contains what a handler or a hook raises, plain or async: the one place that decides.
-
-    A context manager of its own, because it runs for every request and `contextlib` is slow.
-    """
-
-    __slots__ = ("_call", "_fail", "_runner")
-
-    def __init__(
-        self,
-        runner: HandlerRunner[RequestT, ResponseT],
-        call: ServiceCall[RequestT, ResponseT],
-        fail: Callable[[ServiceCall[RequestT, ResponseT], Exception], None],
-    ) -> None:
-        self._runner = runner
-        self._call = call
-        self._fail = fail
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> bool:
-        if isinstance(exc, asyncio.CancelledError):
-            self._runner.cancelled(self._call)
-        elif isinstance(exc, Exception):
-            self._fail(self._call, exc)
-        else:
-            return False
-        return True
 
 
 def settle_kind(

@@ -146,11 +146,8 @@ class ServiceCall(Generic[RequestT, ResponseT]):
         sender = self._sender
         sender.check_type(response)
         with sender.lock:
-            sender.check_open()
-            if self._outcome is not None:
-                raise UsageError(f"{sender.name}: this call was {self._outcome}")
+            sender.begin(self._outcome)
             self._outcome = _ANSWERED
-            sender.begin()
         try:
             late = monotonic() - self._received > LATE
             sender.send(self, self._header, response, late=late)
@@ -249,8 +246,17 @@ class ResponseSender(Generic[ResponseT]):
                 f"{_name_of(self.response_type)}, not a {_name_of(type(response))}"
             )
 
-    def begin(self) -> None:
-        """Announce a `send`, under the lock: `close` waits for it."""
+    def begin(self, outcome: str | None = None) -> None:
+        """Announce a `send`, under the lock: `close` waits for it.
+
+        Raises:
+            UsageError: the call has an outcome already.
+            SessionClosed, ContextShutdown: the server has ended.
+        """
+        if self.ending is not None:
+            raise self.ending()
+        if outcome is not None:
+            raise UsageError(f"{self.name}: this call was {outcome}")
         self._sending += 1
 
     def send(self, call: object, header: RequestHeader, response: ResponseT, *, late: bool) -> None:
@@ -286,7 +292,6 @@ class ResponseSender(Generic[ResponseT]):
             SessionClosed, ContextShutdown: the server has ended.
         """
         with self.lock:
-            self.check_open()
             self.begin()
         return self._try(call, header, response, late=True)
 

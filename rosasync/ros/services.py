@@ -49,8 +49,12 @@ def take_requests(take: Callable[[Any], Any], request_type: type, most: int) -> 
     A request that cannot be read does not hide those behind it, although the middleware reports
     it either as an error, which is logged, or as an empty queue.
     """
-    taken = (take_request(take, request_type) for _ in range(most))
-    return [pair for pair in taken if pair is not None]
+    taken = []
+    for _ in range(most):
+        pair = take_request(take, request_type)
+        if pair is not None:
+            taken.append(pair)
+    return taken
 
 
 def qos_of(service: Service) -> QoSProfile:
