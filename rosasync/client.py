@@ -42,6 +42,7 @@ class Client:
         matched_generation: the generation of the graph in which a server was last seen matched.
             Written by the `ServicePool`.
         idle_since: the loop time at which the last lease ended.
+        window: most places. Written by the `ClientSet`.
     """
 
     __slots__ = (
@@ -51,7 +52,7 @@ class Client:
         "_loop",
         "_on_capacity",
         "_port",
-        "_window",
+        "_reserved",
         "closed",
         "counts",
         "idle_since",
@@ -59,6 +60,7 @@ class Client:
         "matched_generation",
         "send",
         "unanswered",
+        "window",
     )
 
     def __init__(
@@ -69,7 +71,8 @@ class Client:
         on_capacity: Callable[[], None],
     ) -> None:
         self._loop = asyncio.get_running_loop()
-        self._window = limits.in_flight
+        self.window = limits.in_flight
+        self._reserved = int(limits.in_flight > 1)
         self._grace = limits.grace
         self._on_capacity = on_capacity
         self.unanswered: dict[int, Call] = {}
@@ -95,8 +98,14 @@ class Client:
 
     @property
     def capacity(self) -> int:
-        """How many more leases fit into the window; negative if leases wait for their place."""
-        return self._window - self.leases - len(self._abandoned)
+        """How many more leases fit into the window; negative if leases wait for their place.
+
+        Abandoned requests leave one place to the next caller, unless calls are exclusive.
+        """
+        window = self.window
+        if abandoned := len(self._abandoned):
+            window -= min(abandoned, window - self._reserved)
+        return window - self.leases
 
     @property
     def is_idle(self) -> bool:
@@ -151,6 +160,8 @@ class Client:
 
     def _deliver(self, sequence_number: int, response: Any) -> None:
         call = self.unanswered.pop(sequence_number, None)
+        if self._abandoned:
+            self._free_earlier(sequence_number)
         if call is not None:
             if call.future.done():
                 self.counts.late += 1
@@ -160,6 +171,16 @@ class Client:
             return
         self.counts.late += 1
         if self._abandoned.pop(sequence_number, None) is not None:
+            self._on_capacity()
+
+    def _free_earlier(self, sequence_number: int) -> None:
+        """Give back the places of the abandoned requests that were sent before an answered one.
+
+        A server's queue keeps the order of one client's requests, so they have left it.
+        """
+        for number in [number for number in self._abandoned if number < sequence_number]:
+            del self._abandoned[number]
+            self.forget_later(number)
             self._on_capacity()
 
     def _end_grace(self) -> None:

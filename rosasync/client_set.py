@@ -81,6 +81,11 @@ class ClientSet:
         return sum(client.abandoned for client in self._clients)
 
     @property
+    def window(self) -> int:
+        """The sum of the windows."""
+        return sum(client.window for client in self._clients)
+
+    @property
     def idle(self) -> int:
         """The number of clients that carry nothing."""
         return sum(client.is_idle for client in self._clients)
@@ -161,11 +166,23 @@ class ClientSet:
             self._on_capacity,
         )
         self._clients.append(client)
+        self.share_queue()
         self.counts.created += 1
         self._growth_failed = False
         self._watch.poll_soon()
         if self._evict_timer is None:
             self._evict_at(self._loop.time() + self._limits.idle)
+
+    def share_queue(self) -> None:
+        """Set the window of every client to its share of the server's queue.
+
+        Call it after every change of the graph.
+        """
+        window = self._limits.window(self._node.count_clients(self._service))
+        for client in self._clients:
+            grows, client.window = client.window < window, window
+            if grows:
+                self._on_capacity()
 
     def drop(self, client: Client) -> None:
         """Remove a client that was destroyed by other means, such as ``Node.destroy_client``."""

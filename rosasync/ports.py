@@ -212,6 +212,13 @@ class NodePort(Protocol):
             ContextShutdown: the node is down.
         """
 
+    def count_clients(self, service: Service) -> int:
+        """Return how many clients have the service's name, of all processes. Cheap.
+
+        Raises:
+            ContextShutdown: the node is down.
+        """
+
     def find_servers(self, service: Service) -> frozenset[Hashable]:
         """Identify the servers that fit: by name, type and QoS.
 

@@ -110,6 +110,7 @@ class ServicePool:
             idle=self._clients.idle,
             waiting=len(self._queue),
             abandoned=self._clients.abandoned,
+            window=self._clients.window,
             **asdict(self._counts),
         )
 
@@ -258,7 +259,8 @@ class ServicePool:
         self._clients.close()
 
     def on_graph(self) -> None:
-        """Serve the callers who wait for a match, and notice servers that have vanished."""
+        """Look at the graph again: the share of the queue, matches, servers that have vanished."""
+        self._clients.share_queue()
         if self._queue or self._ready_waiters:
             self._dispatch()
         outstanding = self._counts.in_flight or self._clients.abandoned
