@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rosasync.call import Call
     from rosasync.options import Limits
-    from rosasync.ports import ClientPort, Deliver
+    from rosasync.ports import ClientPort, Deliver, Servers
 
 __all__ = ["Client", "Counts"]
 
@@ -42,6 +42,8 @@ class Client:
         matched_generation: the generation of the graph in which a server was last seen matched.
             Written by the `ServicePool`.
         idle_since: the loop time at which the last lease ended.
+        servers: the servers that requests are sent to; None if they are not known. Written by the
+            `ClientSet`.
         window: most places. Written by the `ClientSet`.
     """
 
@@ -59,6 +61,7 @@ class Client:
         "leases",
         "matched_generation",
         "send",
+        "servers",
         "unanswered",
         "window",
     )
@@ -76,12 +79,14 @@ class Client:
         self._grace = limits.grace
         self._on_capacity = on_capacity
         self.unanswered: dict[int, Call] = {}
-        self._abandoned: dict[int, float] = {}
+        # With the end of each grace period, and the servers that were there.
+        self._abandoned: dict[int, tuple[float, Servers | None]] = {}
         # Runs from the first abandoned request to the end of the last grace period.
         self._grace_timer: asyncio.TimerHandle | None = None
         self.counts = counts
         self.leases = 0
         self.matched_generation = -1
+        self.servers: Servers | None = None
         self.idle_since = self._loop.time()
         self.closed = False
         self._port = open_port(self._deliver)
@@ -135,6 +140,36 @@ class Client:
             self._abandoned.clear()
             self._on_capacity()
 
+    def learn_servers(self, servers: Servers) -> None:
+        """Set the servers for requests to come, and for those of which they are not known yet."""
+        self.servers = servers
+        for call in self.unanswered.values():
+            if call.servers is None:
+                call.servers = servers
+        for number, (ends, known) in self._abandoned.items():
+            if known is None:
+                self._abandoned[number] = ends, servers
+
+    def has_lost(self, servers: Servers) -> bool:
+        """Return whether a request went to servers of which none is left."""
+        outstanding = [call.servers for call in self.unanswered.values()]
+        outstanding += [known for _, known in self._abandoned.values()]
+        return any(known and known.isdisjoint(servers) for known in outstanding)
+
+    def fail_lost(self, servers: Servers, error: Callable[[], Exception]) -> None:
+        """End the calls that went to servers of which none is left, and forget such requests."""
+        for number, call in tuple(self.unanswered.items()):
+            if call.servers and call.servers.isdisjoint(servers):
+                del self.unanswered[number]
+                self._port.forget(number)
+                if not call.future.done():
+                    call.future.set_exception(error())
+        for number, (_, known) in tuple(self._abandoned.items()):
+            if known and known.isdisjoint(servers):
+                del self._abandoned[number]
+                self._port.forget(number)
+        self._on_capacity()
+
     def close(self) -> None:
         """Destroy the rcl client; idempotent. `fail` it first, or its calls never end."""
         if self.closed:
@@ -145,12 +180,12 @@ class Client:
         self._abandoned.clear()
         self._port.close()
 
-    def abandon(self, sequence_number: int) -> None:
+    def abandon(self, sequence_number: int, servers: Servers | None = None) -> None:
         """Keep a place for a request that has lost its caller."""
         if self.closed:
             return
         ends = self._loop.time() + self._grace
-        self._abandoned[sequence_number] = ends
+        self._abandoned[sequence_number] = ends, servers
         if self._grace_timer is None:
             self._grace_timer = self._loop.call_at(ends, self._end_grace)
 
@@ -187,7 +222,7 @@ class Client:
         self._grace_timer = None
         now = self._loop.time()
         while self._abandoned:
-            sequence_number, ends = next(iter(self._abandoned.items()))
+            sequence_number, (ends, _) = next(iter(self._abandoned.items()))
             if ends > now:
                 self._grace_timer = self._loop.call_at(ends, self._end_grace)
                 break

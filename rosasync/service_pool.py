@@ -264,7 +264,7 @@ class ServicePool:
         if self._queue or self._ready_waiters:
             self._dispatch()
         outstanding = self._counts.in_flight or self._clients.abandoned
-        if outstanding and self._gone_timer is None and self._clients.servers_gone():
+        if outstanding and self._gone_timer is None and self._clients.has_lost_requests():
             self._gone_timer = self._loop.call_later(GONE_DELAY, self._end_requests)
 
     # The queue.
@@ -408,6 +408,8 @@ class ServicePool:
             if self._clients.servers_gone():
                 self._watch.advance()
                 self._clients.fail(_Gone)
+            else:
+                self._clients.fail_lost(_Gone)
 
     def _unreached(self, started: float) -> Exception:
         """Make the error for a deadline that passed before the request was sent."""

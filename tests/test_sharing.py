@@ -1,4 +1,4 @@
-"""Sessions that share a server's queue: windows, places that come back, and who is not starved."""
+"""Sessions that share a server's queue, and servers that are replaced."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from rosasync import Limits, ResponseTimeout, Session
+from rosasync import Limits, ResponseTimeout, ServerGone, Session
 from tests.support.echo import ECHO, request_of
 from tests.support.times import LIMIT, TICK, until
 
@@ -158,3 +158,64 @@ async def test_abandoned_requests_leave_a_place_to_the_next_caller(fake_graph: F
                     await session.call(Echo, "/echo", timeout=TICK / 5)
         assert session.pool.statistics().abandoned == 5
         assert (await session.call(Echo, "/echo", Echo.Request(1), timeout=LIMIT)).value == 1
+
+
+async def test_a_call_ends_when_its_server_is_replaced(fake_graph: FakeGraph) -> None:
+    server = fake_graph.serve(Echo, "/echo", echo)
+    async with fake_graph.session() as session:
+        with fake_graph.hold_requests():
+            call = session.start(Echo, "/echo", Echo.Request(1), timeout=None)
+            await until(lambda: in_flight(session) == 1)
+            await asyncio.sleep(0)
+            fake_graph.serve(Echo, "/echo", echo)
+            server.close()
+            with pytest.raises(ServerGone):
+                await asyncio.wait_for(call, LIMIT)
+        assert (await session.call(Echo, "/echo", Echo.Request(2))).value == 2
+        total = session.pool.statistics()
+        assert (total.in_flight, total.abandoned) == (0, 0)
+
+
+async def test_a_call_that_both_servers_have_goes_on(fake_graph: FakeGraph) -> None:
+    first, second = (fake_graph.serve(Echo, "/echo", echo) for _ in range(2))
+    async with fake_graph.session() as session:
+        with fake_graph.hold_requests():
+            call = session.start(Echo, "/echo", Echo.Request(1), timeout=LIMIT)
+            await until(lambda: in_flight(session) == 1)
+            await asyncio.sleep(0)
+            first.close()
+            await asyncio.sleep(2 * TICK)
+            assert not call.done()
+        assert (await call).value == 1
+        assert second.received
+
+
+async def test_abandoned_requests_of_a_server_that_was_replaced_hold_no_place(
+    fake_graph: FakeGraph,
+) -> None:
+    server = fake_graph.serve(Echo, "/echo", echo)
+    async with fake_graph.session(limits=Limits(in_flight=1, grace=1000.0)) as session:
+        await session.call(Echo, "/echo", Echo.Request(0))
+        with fake_graph.drop_requests(), pytest.raises(ResponseTimeout):
+            await session.call(Echo, "/echo", timeout=TICK / 5)
+        assert session.pool.statistics().abandoned == 1
+        fake_graph.serve(Echo, "/echo", echo)
+        server.close()
+        assert (await session.call(Echo, "/echo", Echo.Request(1), timeout=LIMIT)).value == 1
+
+
+async def test_a_call_ends_when_its_stock_server_is_replaced(
+    bridge: Bridge, server: ServerProcess
+) -> None:
+    await server.serve("/replaced", delay="hold")
+    async with Session("caller", bridge=bridge) as session, Session("successor") as successor:
+        await session.wait_for_service(ECHO, "/replaced", timeout=LIMIT)
+        call = session.start(ECHO, "/replaced", request_of("x"), timeout=None)
+        await server.received("/replaced", 1)
+        async with successor.serve(ECHO, "/replaced", lambda call: call.response):
+            service = session.core.arguments.service(ECHO, "/replaced", None)
+            await until(lambda: len(session.core.node.find_servers(service)) == 2)
+            await server.stop("/replaced")
+            with pytest.raises(ServerGone):
+                await asyncio.wait_for(call, LIMIT)
+            await session.call(ECHO, "/replaced", request_of("y"), timeout=LIMIT)
