@@ -188,6 +188,7 @@ class ServicePool:
         try:
             self._enqueue(waiter, waiter.set_result)
             await self._wait(waiter, None if timeout is None else started + timeout)
+            self.check_open()
             return waiter.result()
         except Expired:
             raise self._unreached(started) from None
@@ -220,10 +221,12 @@ class ServicePool:
             clients: how many there are to be.
             match_by: the loop time at which to stop waiting for the match.
         """
-        while len(self._clients) < clients:
+        # At most so often: a client may be evicted before the next one is created.
+        for _ in range(clients):
             self.check_open()
-            self._clients.open()
-            await asyncio.sleep(0)
+            if len(self._clients) < clients:
+                self._clients.open()
+                await asyncio.sleep(0)
         for client in self._clients:
             try:
                 await self._wait_until_ready(client, match_by)
@@ -367,15 +370,16 @@ class ServicePool:
             Expired: the deadline passed.
         """
         self.check_open()
-        if self._is_ready_for(leased):
-            return
-        waiter: asyncio.Future[None] = self._loop.create_future()
-        self._ready_waiters[waiter] = leased
-        self._watch.poll_soon()
-        try:
-            await self._wait(waiter, deadline)
-        finally:
-            del self._ready_waiters[waiter]
+        # Between the wake-up and the turn in which it arrives, the session may end.
+        while not self._is_ready_for(leased):
+            waiter: asyncio.Future[None] = self._loop.create_future()
+            self._ready_waiters[waiter] = leased
+            self._watch.poll_soon()
+            try:
+                await self._wait(waiter, deadline)
+            finally:
+                del self._ready_waiters[waiter]
+            self.check_open()
 
     async def _wait(self, future: asyncio.Future[Any], deadline: float | None) -> None:
         """Wait for a future that a dispatch completes.
