@@ -128,6 +128,8 @@ class ClientSet:
         if self._servers_generation != generation:
             # The query takes 0.3 ms: not while the caller waits to send.
             self._servers_generation = generation
+            for each in self._clients:
+                each.servers = None
             self._loop.call_soon(self._learn_servers)
         return True
 

@@ -321,20 +321,22 @@ async def test_a_leased_call_woken_in_the_turn_of_the_end_is_not_sent(
     fake_graph: FakeGraph,
 ) -> None:
     fake_graph.serve(Echo, "/echo", echo)
-    async with fake_graph.session(limits=Limits(in_flight=1)) as session:
-        async with session.pool.lease(Echo, "/echo") as leased:
-            client = the_client(fake_graph)
-            with fake_graph.drop_responses(), pytest.raises(ResponseTimeout):
-                await leased.call(Echo.Request(1), timeout=0.0)
-            waiting = asyncio.create_task(leased.call(Echo.Request(2), timeout=None))
-            await asyncio.sleep(0)
-            client.deliver(1, Echo.Response())
-            # The late response has given the place back, and this dispatch grants it.
-            fake_graph.changed()
-            session.pool.end(lambda: SessionClosed("the session is closed"))
-            with pytest.raises(SessionClosed):
-                await asyncio.wait_for(waiting, LIMIT)
-            assert client.sent == [1]
+    async with (
+        fake_graph.session(limits=Limits(in_flight=1)) as session,
+        session.pool.lease(Echo, "/echo") as leased,
+    ):
+        client = the_client(fake_graph)
+        with fake_graph.drop_responses(), pytest.raises(ResponseTimeout):
+            await leased.call(Echo.Request(1), timeout=0.0)
+        waiting = asyncio.create_task(leased.call(Echo.Request(2), timeout=None))
+        await asyncio.sleep(0)
+        client.deliver(1, Echo.Response())
+        # The late response has given the place back, and this dispatch grants it.
+        fake_graph.changed()
+        session.pool.end(lambda: SessionClosed("the session is closed"))
+        with pytest.raises(SessionClosed):
+            await asyncio.wait_for(waiting, LIMIT)
+        assert client.sent == [1]
 
 
 async def test_a_lease_granted_in_the_turn_of_the_end_is_none(fake_graph: FakeGraph) -> None:

@@ -176,6 +176,25 @@ async def test_a_call_ends_when_its_server_is_replaced(fake_graph: FakeGraph) ->
         assert (total.in_flight, total.abandoned) == (0, 0)
 
 
+async def test_a_call_to_the_successor_does_not_end_with_its_predecessor(
+    fake_graph: FakeGraph,
+) -> None:
+    server = fake_graph.serve(Echo, "/echo", echo)
+    async with fake_graph.session() as session:
+        await session.call(Echo, "/echo", Echo.Request(0))
+        await asyncio.sleep(0)
+        successor = fake_graph.serve(Echo, "/echo", echo)
+        server.close()
+        with fake_graph.hold_requests():
+            call = session.start(Echo, "/echo", Echo.Request(1), timeout=LIMIT)
+            for _ in range(3):
+                fake_graph.changed()
+                await asyncio.sleep(TICK)
+            assert not call.done()
+        assert (await call).value == 1
+        assert len(successor.received) == 1
+
+
 async def test_a_call_that_both_servers_have_goes_on(fake_graph: FakeGraph) -> None:
     first, second = (fake_graph.serve(Echo, "/echo", echo) for _ in range(2))
     async with fake_graph.session() as session:
