@@ -55,6 +55,7 @@ class Client:
         "_on_capacity",
         "_port",
         "_reserved",
+        "_superseded",
         "closed",
         "counts",
         "idle_since",
@@ -81,6 +82,8 @@ class Client:
         self.unanswered: dict[int, Call] = {}
         # With the end of each grace period, and the servers that were there.
         self._abandoned: dict[int, tuple[float, Servers | None]] = {}
+        # Requests that take no place, with the timers that end the wait for their late responses.
+        self._superseded: dict[int, asyncio.TimerHandle] = {}
         # Runs from the first abandoned request to the end of the last grace period.
         self._grace_timer: asyncio.TimerHandle | None = None
         self.counts = counts
@@ -177,6 +180,9 @@ class Client:
         self.closed = True
         if self._grace_timer is not None:
             self._grace_timer.cancel()
+        for timer in self._superseded.values():
+            timer.cancel()
+        self._superseded.clear()
         self._abandoned.clear()
         self._port.close()
 
@@ -191,7 +197,8 @@ class Client:
 
     def forget_later(self, sequence_number: int) -> None:
         """Expect a late response for the grace period, without keeping a place for it."""
-        self._loop.call_later(self._grace, self._port.forget, sequence_number)
+        timer = self._loop.call_later(self._grace, self._forget, sequence_number)
+        self._superseded[sequence_number] = timer
 
     def _deliver(self, sequence_number: int, response: Any) -> None:
         call = self.unanswered.pop(sequence_number, None)
@@ -207,6 +214,12 @@ class Client:
         self.counts.late += 1
         if self._abandoned.pop(sequence_number, None) is not None:
             self._on_capacity()
+        elif (timer := self._superseded.pop(sequence_number, None)) is not None:
+            timer.cancel()
+
+    def _forget(self, sequence_number: int) -> None:
+        del self._superseded[sequence_number]
+        self._port.forget(sequence_number)
 
     def _free_earlier(self, sequence_number: int) -> None:
         """Give back the places of the abandoned requests that were sent before an answered one.

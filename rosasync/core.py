@@ -133,18 +133,30 @@ class Core:
 
     async def _end(self) -> None:
         atexit.unregister(self._exit)
-        await asyncio.gather(*(server.aclose() for server in self.servers))
-        self.pool.end(session_closed)
-        self.node.stop()
-        self.gateway.close()
-        with anyio.move_on_after(END_TIMEOUT, shield=True):
-            await self.node.stopped()
-            self.node.join()
-            self.node.close()
-            return
-        logger.warning(
-            "a callback of node %s still runs: its executor thread is left behind", self.name
-        )
+        # Each step also if the end of the loop cancels this task, as `asyncio.run` does.
+        try:
+            await asyncio.gather(*(server.aclose() for server in self.servers))
+        finally:
+            self.pool.end(session_closed)
+            self._end_servers(session_closed)
+            self.node.stop()
+            self.gateway.close()
+            await self._close_node()
+
+    async def _close_node(self) -> None:
+        stuck = False
+        try:
+            with anyio.move_on_after(END_TIMEOUT, shield=True) as scope:
+                await self.node.stopped()
+            stuck = scope.cancelled_caught
+        finally:
+            if not stuck and self.node.join():
+                self.node.close()
+            else:
+                logger.warning(
+                    "a callback of node %s still runs: its executor thread is left behind",
+                    self.name,
+                )
 
     def _graph_changed(self) -> None:
         self.pool.graph_changed()

@@ -454,7 +454,7 @@ class ServicePool:
             case PortDestroyed():
                 self._clients.drop(call.client)
                 return self._errors.client_destroyed()
-            case _ if not self._node.ok():
+            case Exception() if not self._node.ok():
                 return ContextShutdown() if self._ending is None else self._ending()
         return error
 

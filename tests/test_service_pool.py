@@ -355,3 +355,34 @@ async def test_warming_ends_if_clients_are_evicted_at_once(fake_graph: FakeGraph
     async with fake_graph.session(limits=Limits(clients=3, idle=0.0)) as session:
         await asyncio.wait_for(session.pool.warm(Echo, "/echo", 3), LIMIT)
         assert session.pool.statistics().created <= 3
+
+
+async def test_no_timer_of_a_superseded_attempt_outlives_its_client(
+    fake_graph: FakeGraph, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loop = asyncio.get_running_loop()
+    timers: list[asyncio.TimerHandle] = []
+    call_at = loop.call_at
+
+    def spy(when: float, callback: Any, *args: Any, **options: Any) -> asyncio.TimerHandle:
+        timers.append(call_at(when, callback, *args, **options))
+        return timers[-1]
+
+    fake_graph.serve(Echo, "/echo", echo)
+    async with fake_graph.session(limits=Limits(grace=LIMIT)) as session:
+        await session.wait_for_service(Echo, "/echo")
+        monkeypatch.setattr(loop, "call_at", spy)
+        with fake_graph.drop_responses():
+            task = session.start(Echo, "/echo", Echo.Request(1), retry=Retry(2, TICK))
+            await until(lambda: the_client(fake_graph).sent)
+        assert (await task).value == 1
+        assert session.pool.statistics().retried == 1
+    assert not [t for t in timers if t.when() > loop.time() and not t.cancelled()]
+
+
+def test_servers_of_the_fake_graph_are_told_apart() -> None:
+    graph = FakeGraph()
+    first, second = (graph.serve(Echo, "/echo", echo) for _ in range(2))
+    second.close()
+    assert len(graph.servers) == 1
+    assert graph.servers[0] is first

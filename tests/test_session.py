@@ -193,6 +193,31 @@ async def test_closing_goes_on_when_cancelled(bridge: Bridge, echo: str) -> None
     await session.aclose()
 
 
+@pytest.mark.parametrize("turns", [1, 3, 10])
+def test_the_end_of_the_loop_does_not_cut_the_close_short(bridge: Bridge, turns: int) -> None:
+    async def leave() -> Session:
+        session = Session("interrupted", bridge=bridge)
+        await session.__aenter__()
+        server = session.serve(Trigger, "/late", lambda request, response: response)
+        await session.wait_for_service(Trigger, "/late")
+        closing.append(asyncio.create_task(session.aclose()))
+        servers.append(server)
+        for _ in range(turns):
+            await asyncio.sleep(0)
+        return session
+
+    closing: list[asyncio.Task[None]] = []
+    servers: list[Any] = []
+    threads = set(threading.enumerate())
+    # It cancels every task that is left, also the one that closes the session.
+    session = asyncio.run(leave())
+    assert session.closed
+    assert closing[0].done()
+    assert not session.statistics().servers
+    assert session.pool.statistics().clients == 0
+    assert set(threading.enumerate()) <= threads
+
+
 async def test_two_sessions_in_one_process(bridge: Bridge, echo: str) -> None:
     async with Session("one", bridge=bridge) as one, Session("two", bridge=bridge) as two:
 

@@ -37,7 +37,7 @@ __all__ = [
 ]
 
 
-@dataclass
+@dataclass(eq=False)
 class FakeServer:
     """A server in a `FakeGraph`.
 
