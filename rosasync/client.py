@@ -17,7 +17,11 @@ __all__ = ["Client", "Counts"]
 
 @dataclass(slots=True)
 class Counts:
-    """The running totals of one service, over all its clients."""
+    """The counters of one service, over all its clients.
+
+    Shared by `Call`, `Client`, `ClientSet` and `ServicePool`, which count what they see happen. All
+    of them run on the loop's thread.
+    """
 
     in_flight: int = 0
     peak: int = 0
@@ -37,8 +41,8 @@ class Client:
     place in the window, as a lease does, until its late response arrives or the grace period ends.
 
     Attributes:
-        unanswered: the calls in flight, by sequence number. Written by `Call` as well.
-        leases: how many callers may send.
+        unanswered: the calls in flight, by sequence number. `Call` adds itself and its attempts.
+        leases: the number of open leases. `ClientSet.lease` adds one, `release` ends one.
         matched_generation: the generation of the graph in which a server was last seen matched.
             Written by the `ServicePool`.
         idle_since: the loop time at which the last lease ended.
@@ -95,7 +99,10 @@ class Client:
 
     @property
     def capacity(self) -> int:
-        """How many more leases fit into the window; negative if leases wait for their place."""
+        """How many more leases fit into the window.
+
+        It is negative while a caller with a lease waits for abandoned requests to free its place.
+        """
         return self._window - self.leases - len(self._abandoned)
 
     @property
@@ -137,7 +144,10 @@ class Client:
         self._port.close()
 
     def abandon(self, sequence_number: int) -> None:
-        """Keep a place for a request that has lost its caller."""
+        """Keep the place of a request whose caller has left.
+
+        It is freed by the late response, or after ``Limits.grace`` seconds.
+        """
         if self.closed:
             return
         ends = self._loop.time() + self._grace
@@ -147,6 +157,7 @@ class Client:
 
     def forget_later(self, sequence_number: int) -> None:
         """Expect a late response for the grace period, without keeping a place for it."""
+        # `close` leaves this timer running: a closed port ignores the call.
         self._loop.call_later(self._grace, self._port.forget, sequence_number)
 
     def _deliver(self, sequence_number: int, response: Any) -> None:

@@ -1,4 +1,4 @@
-"""Limits, Retry, the options of a session, and the checks of their values."""
+"""Limits, Retry and the options of a session, and the checks of their values."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ __all__ = [
 
 
 def check_seconds(name: str, value: SupportsFloat) -> float:
-    """Return ``value``, any real number but a bool, as a float.
+    """Return ``value`` as a float. It may be any real number except a bool.
 
     Raises:
         TypeError: it is not a number.
@@ -56,7 +56,7 @@ def check_timeout(value: Timeout, default: float | None) -> float | None:
 
 
 def check_count(name: str, value: SupportsIndex, least: int) -> int:
-    """Return ``value``, any whole number but a bool, as an int of at least ``least``.
+    """Return ``value`` as an int. It may be any whole number from ``least`` on, except a bool.
 
     Raises:
         TypeError: it is not a whole number.
@@ -105,10 +105,11 @@ class Limits:
     own.
 
     Attributes:
-        clients: most rclpy clients for each service.
-        in_flight: most outstanding requests for each client. A request that was cancelled or timed
-            out counts until the server has dealt with it, see ``grace``.
-        waiting: most callers that wait for each service; further callers get `PoolFull`.
+        clients: the maximum number of rclpy clients for each service.
+        in_flight: the maximum number of outstanding requests for each client. A request that was
+            cancelled or timed out counts until the server has dealt with it, see ``grace``.
+        waiting: the maximum number of callers that wait for each service; further callers get
+            `PoolFull`.
         idle: seconds after which an unused client is destroyed.
         grace: seconds for which a cancelled or timed-out request counts as outstanding, unless its
             late response arrives sooner. It may still be in the server's queue.
@@ -136,12 +137,12 @@ class Limits:
 class Retry:
     """When to send an unanswered request again; only for services that may run twice.
 
-    The first answer to any attempt wins. The deadline is still that of the whole call.
+    The first response to any attempt wins. The deadline still covers the whole call.
 
     Attributes:
-        attempts: how often the request is sent at most, including the first time.
-        after: seconds to wait for an answer before the second attempt.
-        backoff: the factor by which that wait grows with each further attempt.
+        attempts: the maximum number of times the request is sent, including the first.
+        after: seconds to wait for a response before the second attempt.
+        backoff: the factor by which this wait grows with each further attempt.
 
     Raises:
         TypeError: a value is not a number.
