@@ -12,11 +12,17 @@ __all__ = ["Signal", "Signals"]
 M = TypeVar("M")
 
 MOST = 16
-"""Eventfds of a kind at the most: enough to tell members apart, without using up descriptors."""
+"""Maximum number of eventfds of one kind. More would locate members better, but use descriptors."""
 
 
 class Signal(Generic[M]):
-    """An eventfd, the members that share it, and those of them that wait for something."""
+    """An eventfd, and the members that share it.
+
+    Attributes:
+        members: the members. Written by `Signals`.
+        waiting: those that wait for something, the last to begin waiting last. Written by them.
+        fd: the file descriptor.
+    """
 
     def __init__(
         self, loop: asyncio.AbstractEventLoop, take: Callable[[Signal[M], int], None]
