@@ -283,7 +283,7 @@ class _Submission(Future[Any]):
                 self.fail(SessionClosed("the session's loop was closed"))
 
     def _on_done(self, _: Future[Any]) -> None:
-        """Cancel the call if the future was cancelled. Runs once, on the thread that completed it."""
+        """Cancel the call if the future was cancelled. Runs once, on the thread that ended it."""
         self._gateway.discard(self)
         if self.cancelled():
             # concurrent.futures.wait and as_completed see the cancellation only now.

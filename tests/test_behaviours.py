@@ -86,7 +86,7 @@ async def ticked(behaviour: Behaviour) -> Status:
 
 
 class TestOutcomes:
-    """How a run ends, and where its response, error and feedback go."""
+    """The status of a run, and its response, error and feedback."""
 
     async def test_an_answer_is_success(self, fake_session: Session) -> None:
         answers: list[Any] = []
@@ -363,7 +363,7 @@ class TestSetup:
     async def test_it_does_not_wait_for_a_server(self, fake_session: Session) -> None:
         for leaf in (CallService("a", ECHO, "/absent"), WaitForService("b", ECHO, "/absent")):
             with ThreadPoolExecutor() as threads:
-                # The loop stands still, so setup cannot wait for it.
+                # The loop is blocked, so setup cannot wait for it.
                 threads.submit(ready, leaf, fake_session).result(LIMIT)
             assert isinstance(leaf.proxy, AsyncServiceProxy)
 
