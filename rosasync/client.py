@@ -37,8 +37,8 @@ class Counts:
 class Client:
     """An rcl client, its window, and the requests it carries. Confined to the loop's thread.
 
-    An abandoned request has no caller any more, but may still be in the server's queue. It takes a
-    place in the window, as a lease does, until its late response arrives or the grace period ends.
+    An abandoned request no longer has a caller, but may still be in the server's queue. It takes a
+    place in the window, like a lease, until its late response arrives or the grace period ends.
 
     Attributes:
         unanswered: the calls in flight, by sequence number. `Call` adds itself and its attempts.
@@ -78,7 +78,7 @@ class Client:
         self._on_capacity = on_capacity
         self.unanswered: dict[int, Call] = {}
         self._abandoned: dict[int, float] = {}
-        # Runs from the first abandoned request to the end of the last grace period.
+        # The first abandoned request starts it. It stops when no abandoned request is left.
         self._grace_timer: asyncio.TimerHandle | None = None
         self.counts = counts
         self.leases = 0

@@ -170,7 +170,7 @@ class ClientSet:
             self._evict_at(self._loop.time() + self._limits.idle)
 
     def drop(self, client: Client) -> None:
-        """Remove a client that was destroyed by other means, such as ``Node.destroy_client``."""
+        """Remove a client that other code has destroyed, for example by ``Node.destroy_client``."""
         if client in self._clients:
             self._clients.remove(client)
             client.fail(self._errors.client_destroyed)

@@ -76,7 +76,7 @@ class LoopGateway:
                 try:
                     self.loop.call_soon_threadsafe(self._drain)
                 except RuntimeError:
-                    # The loop was closed by its own thread in between.
+                    # The loop was closed, on its own thread, since the check.
                     self._calls.clear()
             self.check_open()
 

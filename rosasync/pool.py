@@ -185,7 +185,7 @@ class ClientPool:
         return pool
 
     def graph_changed(self) -> None:
-        """Have the services check the ROS graph, which has changed."""
+        """Make the services check the ROS graph again, because it has changed."""
         self._watch.changed()
 
     def check_open(self) -> None:

@@ -1,4 +1,4 @@
-"""Portal: calls from other threads than the loop's, as ``session.from_thread``."""
+"""Portal: calls from threads other than the loop's, as ``session.from_thread``."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ MARGIN = 1.0
 
 
 class Portal:
-    """Calls services from other threads than the loop's: ``session.from_thread``.
+    """Calls services from threads other than the loop's: ``session.from_thread``.
 
     For worker threads, GUI toolkits and libraries that block; in the loop, use `Session.call`. On
     the loop's own thread, and on the session's executor thread (which runs the node's callbacks), a

@@ -143,8 +143,7 @@ class AsyncServiceProxy(Generic[RequestT, ResponseT]):
 
         Args:
             request: a message, a mapping of its fields, or None for an empty one.
-            timeout: seconds for the whole call, from now on; None for no deadline; if left out, the
-                session's.
+            timeout: seconds for the whole call; None for no deadline; if left out, the session's.
             wait: False to fail at once if there is no server.
 
         Raises:
@@ -171,7 +170,7 @@ class AsyncServiceProxy(Generic[RequestT, ResponseT]):
         """Wait for a server, which replaces the previous operation. The state becomes WAITING.
 
         Args:
-            timeout: seconds from now on; None for no deadline, ``...`` for the session's.
+            timeout: seconds; None for no deadline, ``...`` for the session's.
 
         Raises:
             TypeError, ValueError: the timeout does not fit; the state is unchanged.

@@ -154,7 +154,7 @@ class ServiceServer(Generic[RequestT, ResponseT]):
 
     @property
     def srv_name(self) -> str:
-        """The resolved service name, also after the end."""
+        """The resolved service name. Also available after the end."""
         return self._name
 
     @property
@@ -169,7 +169,7 @@ class ServiceServer(Generic[RequestT, ResponseT]):
 
     @property
     def qos(self) -> Any:
-        """The ``QoSProfile`` in use: a snapshot, also after the end."""
+        """A snapshot of the ``QoSProfile`` in use. Also available after the end."""
         return self._qos
 
     @property
@@ -228,7 +228,7 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         await until_done(self._end_task)
 
     def exclude_caller(self) -> None:
-        """Do not wait for the handler that calls this when the server ends.
+        """Exclude the calling handler from those that the end of the server waits for.
 
         For the session: a handler that closes its session would otherwise wait for itself.
         """
@@ -369,7 +369,7 @@ class _CallQueue(Generic[RequestT, ResponseT]):
         self._closed = False
         # Each with a number in the order of arrival, by which `_put_back` finds its place.
         self._calls: deque[tuple[int, ServiceCall[RequestT, ResponseT]]] = deque()
-        # Completed with an entry of `_calls`, or with None at the end.
+        # Each is completed with an entry of `_calls`, or with None when the queue is closed.
         self._getters: deque[
             asyncio.Future[tuple[int, ServiceCall[RequestT, ResponseT]] | None]
         ] = deque()
@@ -420,7 +420,7 @@ class _CallQueue(Generic[RequestT, ResponseT]):
         return None if entry is None else entry[1]
 
     def close(self) -> None:
-        """End the iterators once no call waits any more; idempotent."""
+        """End the iterators once no call is left; idempotent."""
         self._closed = True
         while self._getters:
             getter = self._getters.popleft()

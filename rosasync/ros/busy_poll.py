@@ -19,10 +19,10 @@ class Pollable(Protocol):
         """Whether a response is expected."""
 
     def take_all(self) -> None:
-        """Take the responses that have come."""
+        """Take the responses that have arrived."""
 
     def start_signalling(self) -> None:
-        """Have responses wake the loop."""
+        """Let responses wake the loop."""
 
 
 class BusyPoll:

@@ -99,7 +99,7 @@ class DirectBridge:
             raise
 
     def refuse(self) -> None:
-        """Have every later send fail, after the context was shut down.
+        """Make every later send fail, because the context was shut down.
 
         rcl sends requests even then, and their responses do not arrive.
         """
@@ -260,7 +260,7 @@ class DirectClient:
             self._rcl.signal_responses(self.handle, None)
 
     def refuse(self) -> None:
-        """Have every later send fail."""
+        """Make every later send fail."""
         self.send_request = self._refuse_request
 
     def close(self) -> None:
@@ -276,7 +276,7 @@ class DirectClient:
         self._retire(self._client)
 
     def start_signalling(self) -> None:
-        """Have responses wake the loop, including those that have come already."""
+        """Let responses wake the loop, including those that are queued already."""
         if self._rcl.signal_responses(self.handle, self._signal.fd):
             self._signalling = True
         elif not is_destroyed(self.handle):

@@ -78,7 +78,7 @@ class ExecutorBridge:
         return opened
 
     def refuse(self) -> None:
-        """Have every later send fail, after the context was shut down.
+        """Make every later send fail, because the context was shut down.
 
         rcl sends requests even then, and their responses do not arrive.
         """
@@ -140,7 +140,7 @@ class ExecutorClient:
             self._client.remove_pending_request(future)
 
     def refuse(self) -> None:
-        """Have every later send fail."""
+        """Make every later send fail."""
         self._call_async = self._refuse_request
 
     def close(self) -> None:

@@ -81,10 +81,7 @@ class ExecutorThread:
 
     @property
     def ident(self) -> int | None:
-        """The thread's identifier, as ``threading.get_ident`` gives it; None once it has ended.
-
-        Another thread may get the same one then.
-        """
+        """The thread's ``threading.get_ident``; None once it has ended, because it may be reused."""
         return self._thread.ident if self._thread.is_alive() else None
 
     def enter(self, user: ThreadUser) -> bool:
@@ -194,7 +191,7 @@ class ExecutorThread:
 
 
 class _OwnExecutor(SingleThreadedExecutor):  # type: ignore[misc]
-    """An executor with a thread of its own, found by ``node.executor``."""
+    """The executor of an `ExecutorThread`, which other sessions find by ``node.executor``."""
 
     def __init__(self, thread: ExecutorThread) -> None:
         super().__init__(context=thread.node.context)

@@ -200,7 +200,7 @@ class GraphQueries:
         return set(self._services_of(self._node.get_name(), self._node.get_namespace()))
 
     def _services_of(self, name: str, namespace: str) -> dict[str, list[str]]:
-        # A node may leave the graph in between.
+        # The node may have left the graph since it was listed.
         with contextlib.suppress(rclpy_implementation.NodeNameNonExistentError):
             return dict(self._node.get_service_names_and_types_by_node(name, namespace))
         return {}

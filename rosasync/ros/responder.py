@@ -159,7 +159,7 @@ class Responder:
         return Undeliverable(str(error))
 
     def _after_slow_send(self, header: RequestHeader) -> None:
-        """Raise if the response was dropped in the end, and not sent."""
+        """Raise if the middleware dropped the response after it had waited."""
         warned = bool(__warningregistry__)
         __warningregistry__.clear()
         guid = client_of(header)

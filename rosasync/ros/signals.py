@@ -39,7 +39,7 @@ class Signal(Generic[M]):
             raise
 
     def close(self) -> None:
-        """Close the eventfd, when the middleware does not write to it any more."""
+        """Close the eventfd. The middleware must have stopped writing to it."""
         if not self._loop.is_closed():
             self._loop.remove_reader(self.fd)
         os.close(self.fd)
@@ -99,7 +99,7 @@ class Signals(Generic[M]):
         return signal
 
     def leave(self, member: M, signal: Signal[M]) -> None:
-        """Remove a member for which the middleware does not signal any more; idempotent."""
+        """Remove a member; idempotent. The middleware must have stopped signalling for it."""
         signal.members.pop(member, None)
         signal.waiting.pop(member, None)
         if not signal.members and len(self._signals) > 1 and signal in self._signals:

@@ -222,7 +222,7 @@ class FakeGraph:
             setattr(self, name, before)
 
     def find(self, srv_type: str, srv_name: str) -> list[FakeServer]:
-        """Return the servers of a service, given the names of its type and of itself."""
+        """Return the servers of a service, by the names of its type and the service."""
         return [
             server
             for server in self.servers
