@@ -81,7 +81,7 @@ class ExecutorThread:
 
     @property
     def ident(self) -> int | None:
-        """The thread's ``threading.get_ident``; None once it has ended, because it may be reused."""
+        """The thread's identifier; None once it has ended, because another thread may reuse it."""
         return self._thread.ident if self._thread.is_alive() else None
 
     def enter(self, user: ThreadUser) -> bool:
