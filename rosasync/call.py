@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rosasync.client import Client
     from rosasync.options import Retry
+    from rosasync.ports import Servers
 
 __all__ = ["Call"]
 
@@ -23,6 +24,8 @@ class Call:
 
     Attributes:
         future: receives the response.
+        servers: the servers that the graph showed at the last attempt; None if they are not known
+            yet. `Client.learn_servers` sets them then.
         started: whether `start` was called.
         in_flight: whether it takes a place: it has started and not ended.
     """
@@ -36,10 +39,12 @@ class Call:
         "future",
         "in_flight",
         "request",
+        "servers",
         "started",
     )
 
     client: Client
+    servers: Servers | None
     _attempts: _Attempts
     _sequence_number: int
 
@@ -56,6 +61,7 @@ class Call:
     def start(self, client: Client) -> None:
         """Send the request. If that fails, set the error on the future."""
         self.client = client
+        self.servers = client.servers
         self.started = self.in_flight = True
         counts = client.counts
         counts.in_flight += 1
@@ -82,7 +88,7 @@ class Call:
             self._attempts.end()
             del self._attempts  # Break the reference cycle.
         elif client.unanswered.pop(self._sequence_number, None) is not None:
-            client.abandon(self._sequence_number)
+            client.abandon(self._sequence_number, self.servers)
         if not self._leased:
             client.release()
 
@@ -118,6 +124,7 @@ class _Attempts:
         except Exception as error:
             future.set_exception(error)
             return
+        self._call.servers = self._client.servers
         self._client.unanswered[sequence_number] = self._call
         self._sent.append(sequence_number)
         self._client.counts.retried += 1
@@ -138,6 +145,6 @@ class _Attempts:
             if client.unanswered.pop(sequence_number, None) is None:
                 continue
             if sequence_number > answered:
-                client.abandon(sequence_number)
+                client.abandon(sequence_number, self._call.servers)
             else:
                 client.forget_later(sequence_number)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rosasync.call import Call
     from rosasync.options import Limits
-    from rosasync.ports import ClientPort, Deliver
+    from rosasync.ports import ClientPort, Deliver, Servers
 
 __all__ = ["Client", "Counts"]
 
@@ -38,14 +38,18 @@ class Client:
     """An rcl client, its window, and the requests it carries. Confined to the loop's thread.
 
     An abandoned request no longer has a caller, but may still be in the server's queue. It takes a
-    place in the window, like a lease, until its late response arrives or the grace period ends.
+    place in the window, like a lease. The place is freed by its late response, by the response to a
+    later request, or at the end of the grace period.
 
     Attributes:
         unanswered: the calls in flight, by sequence number. `Call` adds itself and its attempts.
         leases: the number of open leases. `ClientSet.lease` adds one, `release` ends one.
         matched_generation: the generation of the graph in which a server was last seen matched.
-            Written by the `ServicePool`.
+            Written by the `ClientSet`.
         idle_since: the loop time at which the last lease ended.
+        servers: the servers that receive the requests sent now; None if they are not known yet.
+            Reset by the `ClientSet` when the graph has changed.
+        window: the number of places. Written by the `ClientSet`.
     """
 
     __slots__ = (
@@ -55,14 +59,16 @@ class Client:
         "_loop",
         "_on_capacity",
         "_port",
-        "_window",
+        "_reserved",
         "closed",
         "counts",
         "idle_since",
         "leases",
         "matched_generation",
         "send",
+        "servers",
         "unanswered",
+        "window",
     )
 
     def __init__(
@@ -73,16 +79,19 @@ class Client:
         on_capacity: Callable[[], None],
     ) -> None:
         self._loop = asyncio.get_running_loop()
-        self._window = limits.in_flight
+        self.window = limits.in_flight
+        self._reserved = int(limits.in_flight > 1)
         self._grace = limits.grace
         self._on_capacity = on_capacity
         self.unanswered: dict[int, Call] = {}
-        self._abandoned: dict[int, float] = {}
+        # With the end of each grace period, and the servers that the graph showed at the send.
+        self._abandoned: dict[int, tuple[float, Servers | None]] = {}
         # The first abandoned request starts it. It stops when no abandoned request is left.
         self._grace_timer: asyncio.TimerHandle | None = None
         self.counts = counts
         self.leases = 0
         self.matched_generation = -1
+        self.servers: Servers | None = None
         self.idle_since = self._loop.time()
         self.closed = False
         self._port = open_port(self._deliver)
@@ -101,9 +110,13 @@ class Client:
     def capacity(self) -> int:
         """How many more leases fit into the window.
 
-        It is negative while a caller with a lease waits for abandoned requests to free its place.
+        It is negative while callers with leases wait for their places. Abandoned requests leave one
+        place to the next caller, unless calls are exclusive.
         """
-        return self._window - self.leases - len(self._abandoned)
+        window = self.window
+        if abandoned := len(self._abandoned):
+            window -= min(abandoned, window - self._reserved)
+        return window - self.leases
 
     @property
     def is_idle(self) -> bool:
@@ -133,6 +146,36 @@ class Client:
             self._abandoned.clear()
             self._on_capacity()
 
+    def learn_servers(self, servers: Servers) -> None:
+        """Set the servers of later requests, and of those whose servers are not known yet."""
+        self.servers = servers
+        for call in self.unanswered.values():
+            if call.servers is None:
+                call.servers = servers
+        for number, (ends, known) in self._abandoned.items():
+            if known is None:
+                self._abandoned[number] = ends, servers
+
+    def has_lost(self, servers: Servers) -> bool:
+        """Return whether there is a request whose servers are all gone."""
+        outstanding = [call.servers for call in self.unanswered.values()]
+        outstanding += [known for _, known in self._abandoned.values()]
+        return any(known and known.isdisjoint(servers) for known in outstanding)
+
+    def fail_lost(self, servers: Servers, error: Callable[[], Exception]) -> None:
+        """End the calls whose servers are all gone, and forget the abandoned ones of them."""
+        for number, call in tuple(self.unanswered.items()):
+            if call.servers and call.servers.isdisjoint(servers):
+                del self.unanswered[number]
+                self._port.forget(number)
+                if not call.future.done():
+                    call.future.set_exception(error())
+        for number, (_, known) in tuple(self._abandoned.items()):
+            if known and known.isdisjoint(servers):
+                del self._abandoned[number]
+                self._port.forget(number)
+        self._on_capacity()
+
     def close(self) -> None:
         """Destroy the rcl client; idempotent. `fail` it first, or its calls never end."""
         if self.closed:
@@ -143,15 +186,17 @@ class Client:
         self._abandoned.clear()
         self._port.close()
 
-    def abandon(self, sequence_number: int) -> None:
+    def abandon(self, sequence_number: int, servers: Servers | None = None) -> None:
         """Keep the place of a request whose caller has left.
 
-        It is freed by the late response, or after ``Limits.grace`` seconds.
+        Args:
+            sequence_number: the number of the request.
+            servers: the servers that had the request, None if not known yet.
         """
         if self.closed:
             return
         ends = self._loop.time() + self._grace
-        self._abandoned[sequence_number] = ends
+        self._abandoned[sequence_number] = ends, servers
         if self._grace_timer is None:
             self._grace_timer = self._loop.call_at(ends, self._end_grace)
 
@@ -162,6 +207,8 @@ class Client:
 
     def _deliver(self, sequence_number: int, response: Any) -> None:
         call = self.unanswered.pop(sequence_number, None)
+        if self._abandoned:
+            self._free_earlier(sequence_number)
         if call is not None:
             if call.future.done():
                 self.counts.late += 1
@@ -173,11 +220,21 @@ class Client:
         if self._abandoned.pop(sequence_number, None) is not None:
             self._on_capacity()
 
+    def _free_earlier(self, sequence_number: int) -> None:
+        """Free the places of the abandoned requests that were sent before an answered one.
+
+        A server's queue keeps the order of one client's requests, so they have left it.
+        """
+        for number in [number for number in self._abandoned if number < sequence_number]:
+            del self._abandoned[number]
+            self.forget_later(number)
+            self._on_capacity()
+
     def _end_grace(self) -> None:
         self._grace_timer = None
         now = self._loop.time()
         while self._abandoned:
-            sequence_number, ends = next(iter(self._abandoned.items()))
+            sequence_number, (ends, _) = next(iter(self._abandoned.items()))
             if ends > now:
                 self._grace_timer = self._loop.call_at(ends, self._end_grace)
                 break

@@ -62,6 +62,10 @@ class ClientSet:
         self._evict_timer: asyncio.TimerHandle | None = None
         # The highest count so far, so that each further server is reported once.
         self._servers_counted = 1
+        # The generations of the graph in which the servers were last queried, and in which requests
+        # without servers were last searched for.
+        self._servers_generation = -1
+        self._lost_generation = -1
         # Whether the warning was logged since a client was last created.
         self._growth_failed = False
 
@@ -81,6 +85,11 @@ class ClientSet:
     def abandoned(self) -> int:
         """The number of requests without a caller that still take a place."""
         return sum(client.abandoned for client in self._clients)
+
+    @property
+    def window(self) -> int:
+        """The sum of the windows."""
+        return sum(client.window for client in self._clients)
 
     @property
     def idle(self) -> int:
@@ -119,11 +128,27 @@ class ClientSet:
             return False
         client.matched_generation = generation
         self._warn_of_several_servers()
+        if self._servers_generation != generation:
+            # In a later turn, because the query takes 0.3 ms and the caller is about to send.
+            self._servers_generation = generation
+            for each in self._clients:
+                each.servers = None
+            self._loop.call_soon(self._learn_servers)
         return True
 
     def any_matched(self) -> bool:
         """Return whether a client is matched with a server."""
         return any(self.is_matched(client) for client in self)
+
+    def has_lost_requests(self) -> bool:
+        """Return whether a request has lost all its servers, even if there are new ones."""
+        if self.servers_gone():
+            return True
+        if self._lost_generation == self._watch.generation:
+            return False
+        self._lost_generation = self._watch.generation
+        servers = self._node.find_servers(self._service)
+        return any(client.has_lost(servers) for client in self)
 
     def servers_gone(self) -> bool:
         """Return whether no fitting server is left; other servers of the name do not count."""
@@ -132,6 +157,12 @@ class ClientSet:
         if any(self._is_ready(client) for client in self):
             return False
         return not self._node.find_servers(self._service)
+
+    def fail_lost(self, error: Callable[[], Exception]) -> None:
+        """End the calls whose servers are all gone, even if there are new ones."""
+        servers = self._node.find_servers(self._service)
+        for client in self:
+            client.fail_lost(servers, error)
 
     def grow(self, callers: int) -> None:
         """Create clients while there is less capacity than ``callers``, matched or not.
@@ -163,11 +194,23 @@ class ClientSet:
             self._on_capacity,
         )
         self._clients.append(client)
+        self.share_queue()
         self.counts.created += 1
         self._growth_failed = False
         self._watch.poll_soon()
         if self._evict_timer is None:
             self._evict_at(self._loop.time() + self._limits.idle)
+
+    def share_queue(self) -> None:
+        """Set the window of every client to its share of the server's queue.
+
+        Call it after every change of the graph.
+        """
+        window = self._limits.window(self._node.count_clients(self._service))
+        for client in self._clients:
+            grows, client.window = client.window < window, window
+            if grows:
+                self._on_capacity()
 
     def drop(self, client: Client) -> None:
         """Remove a client that other code has destroyed, for example by ``Node.destroy_client``."""
@@ -189,6 +232,12 @@ class ClientSet:
         for client in self._clients:
             client.close()
         self._clients.clear()
+
+    def _learn_servers(self) -> None:
+        with self._watch.reports_shutdown():
+            servers = self._node.find_servers(self._service)
+            for client in self:
+                client.learn_servers(servers)
 
     def _is_ready(self, client: Client) -> bool:
         try:

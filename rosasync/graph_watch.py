@@ -111,21 +111,29 @@ class GraphWatch:
             self._timer = self._loop.call_later(delay, self._poll)
 
     def _poll(self) -> None:
-        self.polling = False
         self._timer = None
         if not self._node.ok():
+            self.polling = False
             self._on_shutdown()
             return
         if not self._node.graph_events:
             self.advance()
-        self._check_services()
-        if self.polling or self._closed:
+        # `polling` stays set during this, because a dispatch would start the slow timer otherwise.
+        try:
+            self._check_services()
+        finally:
+            self._poll_again()
+
+    def _poll_again(self) -> None:
+        if self._timer is not None or self._closed:
             return
         if any(service.awaits_match for service in self._services):
             self._delay = min(self._delay * 2, POLL_MAX)
             self._poll_in(self._delay)
         elif any(service.is_busy for service in self._services):
             self._poll_in(POLL_CONTEXT)
+        else:
+            self.polling = False
 
     @contextmanager
     def reports_shutdown(self) -> Iterator[None]:

@@ -101,8 +101,11 @@ class Limits:
     """What the pool may use for each service.
 
     By default one client carries at most ten requests at once, because a stock server queues ten
-    and silently drops the rest. ``Limits(clients=8, in_flight=1)`` gives each call a client of its
-    own.
+    and silently drops the rest. All clients of the server share that queue, including those of
+    other processes. So each client gets its share: ``server_depth`` divided by the number of
+    clients that the graph shows, and at least one.
+
+    ``Limits(clients=8, in_flight=1)`` gives each call a client of its own.
 
     Attributes:
         clients: the maximum number of rclpy clients for each service.
@@ -113,6 +116,8 @@ class Limits:
         idle: seconds after which an unused client is destroyed.
         grace: seconds for which a cancelled or timed-out request counts as outstanding, unless its
             late response arrives sooner. It may still be in the server's queue.
+        server_depth: the depth of the server's queue, which all clients of the name share. None if
+            it is deep enough for all of them, so that each may use its whole ``in_flight``.
 
     Raises:
         TypeError: a value is not a number.
@@ -124,6 +129,7 @@ class Limits:
     waiting: int = 10_000
     idle: float = 300.0
     grace: float = 5.0
+    server_depth: int | None = 10
 
     def __post_init__(self) -> None:
         _set(self, "clients", check_count("clients", self.clients, 1))
@@ -131,6 +137,14 @@ class Limits:
         _set(self, "waiting", check_count("waiting", self.waiting, 0))
         _set(self, "idle", check_seconds("idle", self.idle))
         _set(self, "grace", check_seconds("grace", self.grace))
+        if self.server_depth is not None:
+            _set(self, "server_depth", check_count("server_depth", self.server_depth, 1))
+
+    def window(self, clients: int) -> int:
+        """Return the window of each client, given the number of clients in the graph."""
+        if self.server_depth is None:
+            return self.in_flight
+        return min(self.in_flight, max(1, self.server_depth // max(1, clients)))
 
 
 @dataclass(frozen=True, slots=True)

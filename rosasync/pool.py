@@ -116,8 +116,7 @@ class ClientPool:
         try:
             yield leased
         finally:
-            leased.closed = True
-            client.release()
+            leased.end()
 
     async def warm(
         self, srv_type: ServiceType[Any, Any] | str, srv_name: str, clients: int = 1
@@ -257,3 +256,11 @@ class LeasedClient(Generic[RequestT, ResponseT]):
             return response
         finally:
             self._busy = False
+            if self.closed:
+                self._client.release()
+
+    def end(self) -> None:
+        """End the lease. A call that is still in progress keeps the place until it ends."""
+        self.closed = True
+        if not self._busy:
+            self._client.release()

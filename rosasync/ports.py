@@ -16,6 +16,7 @@ __all__ = [
     "PortDestroyed",
     "RequestHeader",
     "RequestId",
+    "Servers",
     "Service",
     "ServicePort",
     "Undeliverable",
@@ -24,6 +25,10 @@ __all__ = [
 
 Deliver = Callable[[int, Any], None]
 """Called on the loop's thread with a sequence number and the response to it."""
+
+
+Servers = frozenset[Hashable]
+"""The identities of servers."""
 
 
 class PortDestroyed(Exception):
@@ -212,7 +217,14 @@ class NodePort(Protocol):
             ContextShutdown: the node is down.
         """
 
-    def find_servers(self, service: Service) -> frozenset[Hashable]:
+    def count_clients(self, service: Service) -> int:
+        """Return how many clients have the service's name, in all processes. Cheap.
+
+        Raises:
+            ContextShutdown: the node is down.
+        """
+
+    def find_servers(self, service: Service) -> Servers:
         """Identify the servers that fit: by name, type and QoS.
 
         If the middleware does not identify servers, the set has a placeholder for each server of

@@ -110,6 +110,7 @@ class ServicePool:
             idle=self._clients.idle,
             waiting=len(self._queue),
             abandoned=self._clients.abandoned,
+            window=self._clients.window,
             **asdict(self._counts),
         )
 
@@ -187,6 +188,7 @@ class ServicePool:
         try:
             self._enqueue(waiter, waiter.set_result)
             await self._wait(waiter, None if timeout is None else started + timeout)
+            self.check_open()
             return waiter.result()
         except Expired:
             raise self._unreached(started) from None
@@ -219,10 +221,12 @@ class ServicePool:
             clients: the number of clients to have.
             match_by: the loop time at which to stop waiting for the matches.
         """
-        while len(self._clients) < clients:
+        # Not `while`: it would never end if each client is evicted before the next is created.
+        for _ in range(clients):
             self.check_open()
-            self._clients.open()
-            await asyncio.sleep(0)
+            if len(self._clients) < clients:
+                self._clients.open()
+                await asyncio.sleep(0)
         for client in self._clients:
             try:
                 await self._wait_until_ready(client, match_by)
@@ -258,11 +262,12 @@ class ServicePool:
         self._clients.close()
 
     def on_graph(self) -> None:
-        """Serve the callers who wait for a match, and notice servers that have vanished."""
+        """Check the graph again: the shares of the queue, the matches and the lost servers."""
+        self._clients.share_queue()
         if self._queue or self._ready_waiters:
             self._dispatch()
         outstanding = self._counts.in_flight or self._clients.abandoned
-        if outstanding and self._gone_timer is None and self._clients.servers_gone():
+        if outstanding and self._gone_timer is None and self._clients.has_lost_requests():
             self._gone_timer = self._loop.call_later(GONE_DELAY, self._end_requests)
 
     # The queue.
@@ -365,15 +370,16 @@ class ServicePool:
             Expired: the deadline passed.
         """
         self.check_open()
-        if self._is_ready_for(leased):
-            return
-        waiter: asyncio.Future[None] = self._loop.create_future()
-        self._ready_waiters[waiter] = leased
-        self._watch.poll_soon()
-        try:
-            await self._wait(waiter, deadline)
-        finally:
-            del self._ready_waiters[waiter]
+        # The session may end, or the place be taken, between the wake-up and this task's turn.
+        while not self._is_ready_for(leased):
+            waiter: asyncio.Future[None] = self._loop.create_future()
+            self._ready_waiters[waiter] = leased
+            self._watch.poll_soon()
+            try:
+                await self._wait(waiter, deadline)
+            finally:
+                del self._ready_waiters[waiter]
+            self.check_open()
 
     async def _wait(self, future: asyncio.Future[Any], deadline: float | None) -> None:
         """Wait for a future that a dispatch completes.
@@ -406,6 +412,8 @@ class ServicePool:
             if self._clients.servers_gone():
                 self._watch.advance()
                 self._clients.fail(_Gone)
+            else:
+                self._clients.fail_lost(_Gone)
 
     def _unreached(self, started: float) -> Exception:
         """Make the error for a deadline that passed before the request was sent."""

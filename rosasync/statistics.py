@@ -45,6 +45,7 @@ class KeyStatistics:
         cancelled: calls cancelled, in any phase.
         failed: calls that ended with another error, such as `ServerGone` or `SessionClosed`.
         abandoned: requests without a caller that still count as outstanding.
+        window: the maximum number of outstanding requests of all clients together, now.
         late: responses that arrived after their caller had left.
         retried: requests sent again.
     """
@@ -60,6 +61,7 @@ class KeyStatistics:
     cancelled: int = 0
     failed: int = 0
     abandoned: int = 0
+    window: int = 0
     late: int = 0
     retried: int = 0
 

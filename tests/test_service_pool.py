@@ -8,7 +8,18 @@ from typing import Any
 
 import pytest
 
-from rosasync import ContextShutdown, Limits, Retry, ServerGone, Session
+from rosasync import (
+    ContextShutdown,
+    Limits,
+    QueueTimeout,
+    ResponseTimeout,
+    Retry,
+    RosasyncError,
+    ServerGone,
+    Session,
+    SessionClosed,
+)
+from rosasync.graph_watch import POLL_MAX
 from rosasync.ports import PortDestroyed
 from rosasync.testing import FakeClient, FakeGraph
 from tests.support.times import LIMIT, TICK, until
@@ -246,3 +257,101 @@ async def test_a_server_of_another_type_is_not_warned_of(
         with caplog.at_level(logging.WARNING, logger="rosasync"):
             assert await ask(session, 1) == 1
     assert not caplog.records
+
+
+@pytest.mark.parametrize("graph_events", [True, False])
+async def test_a_match_without_an_event_is_polled_for_at_short_intervals(
+    graph_events: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    graph = FakeGraph(graph_events=graph_events)
+    graph.serve(Echo, "/echo", echo)
+    loop = asyncio.get_running_loop()
+    call_later = loop.call_later
+    delays: list[float] = []
+
+    def spy(delay: float, callback: Any, *args: Any) -> Any:
+        if callback.__name__ == "_poll":
+            delays.append(delay)
+        return call_later(delay, callback, *args)
+
+    async with graph.session() as session:
+        # The poll that finds the match is the second in a row.
+        monkeypatch.setattr(loop, "call_later", spy)
+        monkeypatch.setattr(FakeClient, "ready", lambda client: len(delays) > 4)
+        assert await ask(session, 1) == 1
+        waits = delays[:5]
+    # The first starts with the call, and the creation of the client replaces it at once.
+    assert max(waits[1:]) <= POLL_MAX
+
+
+async def test_a_poll_that_fails_is_not_the_last(
+    fake_graph: FakeGraph, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loop = asyncio.get_running_loop()
+    failures: list[dict[str, Any]] = []
+    loop.set_exception_handler(lambda _, context: failures.append(context))
+    fake_graph.serve(Echo, "/echo", echo)
+
+    def ready(client: FakeClient) -> bool:
+        if len(failures) < 3:
+            raise RosasyncError("rclpy failed")
+        return True
+
+    async with fake_graph.session() as session:
+        monkeypatch.setattr(FakeClient, "ready", ready)
+        assert await ask(session, 1, timeout=LIMIT) == 1
+    assert len(failures) == 3
+
+
+async def test_a_call_that_outlives_its_lease_keeps_its_place(fake_graph: FakeGraph) -> None:
+    fake_graph.serve(Echo, "/echo", echo)
+    async with fake_graph.session(limits=Limits(in_flight=1, idle=TICK / 10)) as session:
+        with fake_graph.hold_requests():
+            async with session.pool.lease(Echo, "/echo") as leased:
+                call = asyncio.create_task(leased.call(Echo.Request(1), timeout=LIMIT))
+                await until(lambda: session.pool.statistics().in_flight)
+            with pytest.raises(QueueTimeout):
+                await ask(session, 2, timeout=2 * TICK)
+            assert the_client(fake_graph).most == 1
+        assert (await call).value == 1
+        assert await ask(session, 3) == 3
+
+
+async def test_a_leased_call_woken_in_the_turn_of_the_end_is_not_sent(
+    fake_graph: FakeGraph,
+) -> None:
+    fake_graph.serve(Echo, "/echo", echo)
+    async with (
+        fake_graph.session(limits=Limits(in_flight=1)) as session,
+        session.pool.lease(Echo, "/echo") as leased,
+    ):
+        client = the_client(fake_graph)
+        with fake_graph.drop_responses(), pytest.raises(ResponseTimeout):
+            await leased.call(Echo.Request(1), timeout=0.0)
+        waiting = asyncio.create_task(leased.call(Echo.Request(2), timeout=None))
+        await asyncio.sleep(0)
+        client.deliver(1, Echo.Response())
+        # The late response has given the place back, and this dispatch grants it.
+        fake_graph.changed()
+        session.pool.end(lambda: SessionClosed("the session is closed"))
+        with pytest.raises(SessionClosed):
+            await asyncio.wait_for(waiting, LIMIT)
+        assert client.sent == [1]
+
+
+async def test_a_lease_granted_in_the_turn_of_the_end_is_none(fake_graph: FakeGraph) -> None:
+    async with fake_graph.session() as session:
+        service = session.pool.service(Echo, "/echo", None)
+        waiting = asyncio.create_task(service.lease(None))
+        await until(lambda: session.pool.statistics().waiting)
+        fake_graph.serve(Echo, "/echo", echo)
+        session.pool.end(lambda: SessionClosed("the session is closed"))
+        with pytest.raises(SessionClosed):
+            await waiting
+
+
+async def test_warming_ends_if_clients_are_evicted_at_once(fake_graph: FakeGraph) -> None:
+    fake_graph.serve(Echo, "/echo", echo)
+    async with fake_graph.session(limits=Limits(clients=3, idle=0.0)) as session:
+        await asyncio.wait_for(session.pool.warm(Echo, "/echo", 3), LIMIT)
+        assert session.pool.statistics().created <= 3

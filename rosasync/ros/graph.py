@@ -120,6 +120,11 @@ class GraphQueries:
         with uses_node(self._node):
             return self._count_servers(service.key.srv_name)
 
+    def count_clients(self, service: Service) -> int:
+        """Count the clients of the name; see `rosasync.ports.NodePort.count_clients`."""
+        with uses_node(self._node), self._node.handle:
+            return int(self._node.handle.get_count_clients(service.key.srv_name))
+
     def find_servers(self, service: Service) -> frozenset[Hashable]:
         """Identify the servers that fit; see `rosasync.ports.NodePort.find_servers`."""
         name, srv_type, _ = service.key

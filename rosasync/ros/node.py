@@ -151,6 +151,10 @@ class RosNode:
         """Return how many servers have the name, whatever their type."""
         return self._graph.count_servers(service)
 
+    def count_clients(self, service: Service) -> int:
+        """Return how many clients have the name, in all processes."""
+        return self._graph.count_clients(service)
+
     def find_servers(self, service: Service) -> frozenset[Hashable]:
         """Identify the servers that fit: by name, type and QoS."""
         return self._graph.find_servers(service)

@@ -190,6 +190,10 @@ class FakeGraph:
             for node in tuple(self.nodes):
                 node.on_graph()
 
+    def changed_soon(self) -> None:
+        """Report a change of the graph in the loop's next turn."""
+        asyncio.get_running_loop().call_soon(self.changed)
+
     def delay_responses(self, seconds: float) -> AbstractContextManager[None]:
         """Delay responses by a number of seconds, in this block."""
         return self._set_in_block("delay", seconds)
@@ -299,6 +303,7 @@ class FakeNode:
         """Create a client that passes its responses to ``deliver``."""
         client = FakeClient(self, service.key, deliver)
         self.clients.append(client)
+        self.graph.changed_soon()
         return client
 
     def open_service(self, service: Service, deliver: DeliverRequest) -> FakeService:
@@ -311,6 +316,14 @@ class FakeNode:
     def count_servers(self, service: Service) -> int:
         """Return how many servers have this name."""
         return sum(server.srv_name == service.key.srv_name for server in self.graph.servers)
+
+    def count_clients(self, service: Service) -> int:
+        """Return how many clients have this name, of all nodes."""
+        return sum(
+            client.srv_name == service.key.srv_name
+            for node in self.graph.nodes
+            for client in node.clients
+        )
 
     def find_servers(self, service: Service) -> frozenset[Hashable]:
         """Identify the servers of this name and type."""
@@ -390,3 +403,4 @@ class FakeClient:
         if not self.closed:
             self.closed = True
             self.node.clients.remove(self)
+            self.node.graph.changed_soon()
