@@ -1,4 +1,4 @@
-"""What asyncio lacks: shared deadlines, tasks that start at once, uncancellable waits."""
+"""Additions to asyncio: shared deadlines, tasks that start at once, uncancellable waits."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ __all__ = ["Deadlines", "Expired", "start_task", "until_done"]
 T = TypeVar("T")
 
 SPARE = 64
-"""How many met deadlines the heap may hold, in addition to one for each that is not met."""
+"""The heap is swept when it holds twice the entries of the last sweep and this many more."""
 
 Entry = list[Any]
-"""A deadline, a unique number, and the future; set the last to None when the deadline is met."""
+"""A deadline, a unique number and the future. To cancel the deadline, set the future to None. The
+entry is dropped later, because a heap cannot remove one from its middle."""
 
 
 class Expired(Exception):
@@ -39,11 +40,12 @@ class Deadlines:
         self._heap: list[Entry] = []
         self._numbers = itertools.count()
         self._limit = SPARE
+        # Set to `_earliest`. Only an earlier deadline or `close` cancels it.
         self._timer: asyncio.TimerHandle | None = None
         self._earliest = math.inf
 
     def set(self, future: asyncio.Future[Any], deadline: float) -> Entry:
-        """Fail a future at ``deadline``, in loop time, unless it is done or taken out by then."""
+        """Fail a future at ``deadline``, in loop time, unless it is done or cancelled by then."""
         entry: Entry = [deadline, next(self._numbers), future]
         heap = self._heap
         heappush(heap, entry)
@@ -72,7 +74,7 @@ class Deadlines:
         self._timer = self._loop.call_at(deadline, self._expire, deadline)
 
     def _expire(self, deadline: float) -> None:
-        # The loop may call slightly early, because its clock is coarser than its times.
+        # The loop runs timers up to one clock resolution early.
         now = max(deadline, self._loop.time())
         self._earliest = math.inf
         heap = self._heap
@@ -89,8 +91,8 @@ def start_task(
 ) -> asyncio.Task[T]:
     """Run a coroutine up to its first suspension, and the rest as a task.
 
-    As ``asyncio.Task(…, eager_start=True)`` of Python 3.12, which 3.11 lacks and which bypasses the
-    loop's task factory. Call it on the thread of the running loop. The coroutine must not look at
+    Like ``asyncio.Task(…, eager_start=True)``, which Python 3.11 lacks, and which bypasses the task
+    factory of the loop. Call it on the thread of the running loop. The coroutine must not use
     ``asyncio.current_task()`` before its first suspension.
     """
     return loop.create_task(_Started(coroutine))
@@ -116,7 +118,7 @@ class _Started(Coroutine[Any, Any, T]):
             self._outcome = outcome
 
     def send(self, value: Any) -> Any:
-        """Yield what the coroutine awaits already, then resume it."""
+        """Return what the coroutine is already waiting for; from the second time on, resume it."""
         if self._resumed:
             return self._coroutine.send(value)
         self._resumed = True
@@ -130,7 +132,7 @@ class _Started(Coroutine[Any, Any, T]):
         if self._outcome is not None:
             raise self._outcome
         if first and self._awaited is not None:
-            # The task does not know yet what it waits for.
+            # The task has not seen this future yet, so it cannot cancel it itself.
             self._awaited.cancel()
         return self._coroutine.throw(*error)
 
@@ -143,11 +145,11 @@ class _Started(Coroutine[Any, Any, T]):
 
 
 async def until_done(task: asyncio.Task[None]) -> None:
-    """Wait for a task to end. A cancellation is delivered afterwards.
+    """Wait until a task has ended, and only then raise a cancellation of the caller.
 
     Raises:
         Exception: the task raised it.
-        CancelledError: the caller was cancelled; the task is done all the same.
+        CancelledError: the caller was cancelled; the task is done nevertheless.
     """
     cancelled = None
     with anyio.CancelScope(shield=True):

@@ -15,11 +15,11 @@ __all__ = ["ArgumentChecker"]
 
 
 class ArgumentChecker:
-    """Checks what a call is given, before anything is sent. From any thread."""
+    """Checks the arguments of a call before anything is sent. Its methods may run on any thread."""
 
     def __init__(self, node: NodePort) -> None:
         self._node = node
-        # Read and written by single operations, which are atomic.
+        # Needs no lock: each access is a single operation, which is atomic.
         self._known: dict[tuple[Any, str], Service] = {}
 
     def service(self, srv_type: Any, srv_name: str, qos: Any) -> Service:
@@ -49,8 +49,8 @@ class ArgumentChecker:
             request: a message, a mapping of its fields, or None for an empty one.
             timeout: what the caller passed.
             default: the timeout to use if the caller passed none.
-            wait: must be a bool.
-            retry: must be a `Retry` or None.
+            wait: checked to be a bool.
+            retry: checked to be a `Retry` or None.
 
         Raises:
             TypeError, ValueError: an argument does not fit.

@@ -40,7 +40,7 @@ __all__ = ["CallService", "FromBlackboard", "FromConstant", "WaitForService"]
 
 
 class ServiceBehaviour(Behaviour, Generic[RequestT, ResponseT]):  # type: ignore[misc]
-    """The base of both behaviours: it has a proxy from setup to shutdown."""
+    """The base of both behaviours: holds a proxy from `setup` to `shutdown`."""
 
     def __init__(
         self,
@@ -79,14 +79,14 @@ class ServiceBehaviour(Behaviour, Generic[RequestT, ResponseT]):  # type: ignore
             self._proxy.stop_call()
 
     def shutdown(self) -> None:
-        """Cancel the operation, for good; another `setup` starts again."""
+        """Cancel the operation and drop the proxy. `setup` may be called again afterwards."""
         if self._proxy is not None:
             self._proxy.shutdown()
             self._proxy = None
 
     @property
     def proxy(self) -> AsyncServiceProxy[RequestT, ResponseT]:
-        """The proxy, from setup to shutdown.
+        """The proxy, from `setup` to `shutdown`.
 
         Raises:
             UsageError: the behaviour is not set up.
@@ -102,8 +102,8 @@ class CallService(ServiceBehaviour[RequestT, ResponseT]):
     """Calls a service once in each run. It is RUNNING until the response arrives.
 
     It ends with SUCCESS if the call is answered, and with FAILURE if the call fails or if there is
-    no request. If it is interrupted, it cancels the call. A new run never sees an older response:
-    it unsets the blackboard's response and error before it calls.
+    no request. An interruption cancels the call. Each run unsets the response and the error on the
+    blackboard before it calls, so it never shows the result of an earlier run.
 
     Args:
         name: the name of the behaviour.
@@ -158,7 +158,7 @@ class CallService(ServiceBehaviour[RequestT, ResponseT]):
         self._request: Any = request
         self._timeout = timeout
         self._wait = wait
-        self._refusal: Exception | None = None
+        self._request_error: Exception | None = None
         self._on_response = on_response
         self._on_error = on_error
         self._on_feedback = on_feedback
@@ -187,7 +187,7 @@ class CallService(ServiceBehaviour[RequestT, ResponseT]):
         """Start the call."""
         proxy = self.proxy
         proxy.stop_call()
-        self._refusal = None
+        self._request_error = None
         self._unset(self._key_response)
         self._unset(self._key_error)
         request = self._request() if callable(self._request) else self._request
@@ -196,10 +196,10 @@ class CallService(ServiceBehaviour[RequestT, ResponseT]):
                 request = self.blackboard.get(self._key_request)
             proxy.call_service(request, self._timeout, wait=self._wait)
         except (KeyError, TypeError, ValueError) as error:
-            self._refusal = error
+            self._request_error = error
             self.logger.error(f"{self.qualified_name}: no request for {self.srv_name}: {error}")
         else:
-            self._tell(f"calling {self.srv_name}")
+            self._set_feedback(f"calling {self.srv_name}")
 
     def update(self) -> Status:
         """Return the status of the call."""
@@ -207,17 +207,17 @@ class CallService(ServiceBehaviour[RequestT, ResponseT]):
         state = proxy.get_state()
         if state is ProxyState.RUNNING:
             return Status.RUNNING
-        if self._refusal is not None:
-            return self._failed(self._refusal)
+        if self._request_error is not None:
+            return self._failed(self._request_error)
         if state is ProxyState.RESPONSE_READY:
             return self._answered(proxy.get_response())
         for error in proxy.get_errors():
             return self._failed(error)
-        self._tell(f"{self.srv_name}: aborted")
+        self._set_feedback(f"{self.srv_name}: aborted")
         return Status.FAILURE
 
     def _answered(self, response: ResponseT | None) -> Status:
-        self._tell(f"{self.srv_name} answered")
+        self._set_feedback(f"{self.srv_name} answered")
         self._set(self._key_response, response)
         status = None
         if self._on_response is not None and response is not None:
@@ -225,12 +225,12 @@ class CallService(ServiceBehaviour[RequestT, ResponseT]):
         return Status.SUCCESS if status is None else status
 
     def _failed(self, error: Exception) -> Status:
-        self._tell(str(error))
+        self._set_feedback(str(error))
         self._set(self._key_error, error)
         status = None if self._on_error is None else self._on_error(error)
         return Status.FAILURE if status is None else status
 
-    def _tell(self, message: str) -> None:
+    def _set_feedback(self, message: str) -> None:
         self.feedback_message = message
         self._set(self._key_feedback_message, message)
         if self._on_feedback is not None:
@@ -251,7 +251,7 @@ class CallService(ServiceBehaviour[RequestT, ResponseT]):
         if "." not in name:
             self.blackboard.unset(name)
             return
-        # An attribute of an object that may not exist yet.
+        # An attribute cannot be unset, and its object may not exist yet.
         with contextlib.suppress(KeyError):
             self.blackboard.set(name, None)
 
@@ -352,7 +352,7 @@ class WaitForService(ServiceBehaviour[Any, Any]):
         if state is ProxyState.WAITING:
             return Status.RUNNING
         if state is ProxyState.SERVICE_AVAILABLE:
-            self.feedback_message = f"{self.srv_name} is there"
+            self.feedback_message = f"{self.srv_name} is available"
             return Status.SUCCESS
         self.feedback_message = "; ".join(map(str, proxy.get_errors())) or "aborted"
         return Status.FAILURE

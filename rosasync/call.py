@@ -19,13 +19,13 @@ NOT_SENT = 0
 class Call:
     """One request: queued, sent with a client, then answered or given up.
 
-    Confined to the loop's thread. From `start` to `end` it takes a place in the client's window,
-    unless its caller holds a lease (``leased``), which takes the place instead.
+    Confined to the loop's thread. From `start` to `end` it takes a place in the client's window. A
+    call on a lease (``leased``) uses the place of the lease instead.
 
     Attributes:
         future: receives the response.
-        servers: the servers that were there when it was sent; None if they are not known yet.
-            Written by the `Client` as well.
+        servers: the servers that the graph showed at the last attempt; None if they are not known
+            yet. `Client.learn_servers` sets them then.
         started: whether `start` was called.
         in_flight: whether it takes a place: it has started and not ended.
     """
@@ -59,7 +59,7 @@ class Call:
         self._retry = retry
 
     def start(self, client: Client) -> None:
-        """Send the request. If that fails, the future gets the error."""
+        """Send the request. If that fails, set the error on the future."""
         self.client = client
         self.servers = client.servers
         self.started = self.in_flight = True
@@ -80,13 +80,13 @@ class Call:
             self._attempts = _Attempts(self, client, self._retry, sequence_number)
 
     def end(self) -> None:
-        """Give the place back: the response has arrived, or the caller has left."""
+        """Return the place to the client: the response has arrived, or the caller has left."""
         self.in_flight = False
         client = self.client
         client.counts.in_flight -= 1
         if self._retry is not None:
             self._attempts.end()
-            del self._attempts  # It refers back to this call.
+            del self._attempts  # Break the reference cycle.
         elif client.unanswered.pop(self._sequence_number, None) is not None:
             client.abandon(self._sequence_number, self.servers)
         if not self._leased:
@@ -96,7 +96,7 @@ class Call:
 class _Attempts:
     """Sends the request of one call again while it is unanswered.
 
-    Its timer starts with each attempt but the last, and stops with the call.
+    Each attempt except the last starts the timer for the next one. `end` stops it.
     """
 
     __slots__ = ("_call", "_client", "_delay", "_retry", "_sent", "_timer")
@@ -131,10 +131,11 @@ class _Attempts:
         self._arm()
 
     def end(self) -> None:
-        """Withdraw the attempts that are still outstanding.
+        """Abandon the attempts that are still outstanding.
 
-        A server's queue keeps the order of one client's requests. So every attempt that was sent
-        before an answered one has left the queue, and those sent after it may still be there.
+        A server's queue keeps the order of one client's requests. So the attempts that were sent
+        before an answered one have left the queue. Those sent after it may still be there, and keep
+        their places.
         """
         if self._timer is not None:
             self._timer.cancel()

@@ -1,4 +1,4 @@
-"""The errors of one service's calls, with their messages."""
+"""The errors of a service's calls, and their messages."""
 
 from __future__ import annotations
 
@@ -21,47 +21,46 @@ __all__ = ["CallErrors"]
 
 
 class CallErrors:
-    """Makes the errors of one service's calls. ``elapsed`` is always in seconds."""
+    """Makes the errors of one service's calls. ``elapsed`` is in seconds."""
 
     def __init__(self, service: Service, node: NodePort) -> None:
         self._service = service
         self._node = node
 
     def unavailable(self, elapsed: float) -> CallError:
-        """There is no server."""
+        """Return the error for a call that found no server."""
         seen = self._node.explain_missing(self._service)
         message = f"no server for {self._service.key.srv_type} after {elapsed:.3g} s; {seen}"
         return self._make(ServiceUnavailable, message, elapsed)
 
     def queue_timeout(self, elapsed: float, in_flight: int, abandoned: int) -> CallError:
-        """There is a server, but no client became free."""
+        """Return the error for a call that found a server, but no free client."""
         message = (
             f"no client became free within {elapsed:.3g} s: {in_flight} requests are in flight, "
-            f"and {abandoned} abandoned ones still take a place"
+            f"and {abandoned} abandoned requests (cancelled or timed out) still count"
         )
         return self._make(QueueTimeout, message, elapsed)
 
     def response_timeout(self, elapsed: float) -> CallError:
-        """The request was sent, and not answered."""
-        return self._make(
-            ResponseTimeout, f"sent, and not answered within {elapsed:.3g} s", elapsed
-        )
+        """Return the error for a request that was sent and not answered."""
+        message = f"the request was sent, but not answered within {elapsed:.3g} s"
+        return self._make(ResponseTimeout, message, elapsed)
 
     def server_gone(self, elapsed: float) -> CallError:
-        """Every server that fits has vanished."""
+        """Return the error for a request whose servers have all vanished."""
         return self._make(ServerGone, "every server vanished before it answered", elapsed)
 
     def client_destroyed(self) -> ContextShutdown:
-        """Something else than rosasync has destroyed the rclpy client."""
+        """Return the error for an rclpy client that something other than rosasync has destroyed."""
         return ContextShutdown(
-            f"{self._service.key.srv_name}: the client was destroyed by other means than rosasync; "
-            "the next call creates a new one"
+            f"{self._service.key.srv_name}: the client was destroyed by something other than "
+            "rosasync; the next call creates a new one"
         )
 
     def pool_full(self, waiting: int, limit: int) -> PoolFull:
-        """The queue is as long as allowed."""
+        """Return the error for a call that finds the queue full."""
         return PoolFull(
-            f"{self._service.key.srv_name}: {waiting} callers wait for a client, and "
+            f"{self._service.key.srv_name}: {waiting} callers already wait for a client, and "
             f"Limits.waiting={limit} allows no more"
         )
 

@@ -17,7 +17,11 @@ __all__ = ["Client", "Counts"]
 
 @dataclass(slots=True)
 class Counts:
-    """The running totals of one service, over all its clients."""
+    """The counters of one service, over all its clients.
+
+    Shared by `Call`, `Client`, `ClientSet` and `ServicePool`, which count what they see happen. All
+    of them run on the loop's thread.
+    """
 
     in_flight: int = 0
     peak: int = 0
@@ -33,18 +37,19 @@ class Counts:
 class Client:
     """An rcl client, its window, and the requests it carries. Confined to the loop's thread.
 
-    An abandoned request has no caller any more, but may still be in the server's queue. It takes a
-    place in the window, as a lease does, until its late response arrives or the grace period ends.
+    An abandoned request no longer has a caller, but may still be in the server's queue. It takes a
+    place in the window, like a lease. The place is freed by its late response, by the response to a
+    later request, or at the end of the grace period.
 
     Attributes:
-        unanswered: the calls in flight, by sequence number. Written by `Call` as well.
-        leases: how many callers may send.
+        unanswered: the calls in flight, by sequence number. `Call` adds itself and its attempts.
+        leases: the number of open leases. `ClientSet.lease` adds one, `release` ends one.
         matched_generation: the generation of the graph in which a server was last seen matched.
-            Written by the `ServicePool`.
+            Written by the `ClientSet`.
         idle_since: the loop time at which the last lease ended.
-        servers: the servers that requests are sent to; None if they are not known. Written by the
-            `ClientSet`.
-        window: most places. Written by the `ClientSet`.
+        servers: the servers that receive the requests sent now; None if they are not known yet.
+            Reset by the `ClientSet` when the graph has changed.
+        window: the number of places. Written by the `ClientSet`.
     """
 
     __slots__ = (
@@ -80,11 +85,11 @@ class Client:
         self._grace = limits.grace
         self._on_capacity = on_capacity
         self.unanswered: dict[int, Call] = {}
-        # With the end of each grace period, and the servers that were there.
+        # With the end of each grace period, and the servers that the graph showed at the send.
         self._abandoned: dict[int, tuple[float, Servers | None]] = {}
         # Requests that take no place, with the timers that end the wait for their late responses.
         self._superseded: dict[int, asyncio.TimerHandle] = {}
-        # Runs from the first abandoned request to the end of the last grace period.
+        # The first abandoned request starts it. It stops when no abandoned request is left.
         self._grace_timer: asyncio.TimerHandle | None = None
         self.counts = counts
         self.leases = 0
@@ -106,9 +111,10 @@ class Client:
 
     @property
     def capacity(self) -> int:
-        """How many more leases fit into the window; negative if leases wait for their place.
+        """How many more leases fit into the window.
 
-        Abandoned requests leave one place to the next caller, unless calls are exclusive.
+        It is negative while callers with leases wait for their places. Abandoned requests leave one
+        place to the next caller, unless calls are exclusive.
         """
         window = self.window
         if abandoned := len(self._abandoned):
@@ -144,7 +150,7 @@ class Client:
             self._on_capacity()
 
     def learn_servers(self, servers: Servers) -> None:
-        """Set the servers for requests to come, and for those of which they are not known yet."""
+        """Set the servers of later requests, and of those whose servers are not known yet."""
         self.servers = servers
         for call in self.unanswered.values():
             if call.servers is None:
@@ -154,13 +160,13 @@ class Client:
                 self._abandoned[number] = ends, servers
 
     def has_lost(self, servers: Servers) -> bool:
-        """Return whether a request went to servers of which none is left."""
+        """Return whether there is a request whose servers are all gone."""
         outstanding = [call.servers for call in self.unanswered.values()]
         outstanding += [known for _, known in self._abandoned.values()]
         return any(known and known.isdisjoint(servers) for known in outstanding)
 
     def fail_lost(self, servers: Servers, error: Callable[[], Exception]) -> None:
-        """End the calls that went to servers of which none is left, and forget such requests."""
+        """End the calls whose servers are all gone, and forget the abandoned ones of them."""
         for number, call in tuple(self.unanswered.items()):
             if call.servers and call.servers.isdisjoint(servers):
                 del self.unanswered[number]
@@ -187,7 +193,12 @@ class Client:
         self._port.close()
 
     def abandon(self, sequence_number: int, servers: Servers | None = None) -> None:
-        """Keep a place for a request that has lost its caller."""
+        """Keep the place of a request whose caller has left.
+
+        Args:
+            sequence_number: the number of the request.
+            servers: the servers that had the request, None if not known yet.
+        """
         if self.closed:
             return
         ends = self._loop.time() + self._grace
@@ -222,7 +233,7 @@ class Client:
         self._port.forget(sequence_number)
 
     def _free_earlier(self, sequence_number: int) -> None:
-        """Give back the places of the abandoned requests that were sent before an answered one.
+        """Free the places of the abandoned requests that were sent before an answered one.
 
         A server's queue keeps the order of one client's requests, so they have left it.
         """

@@ -22,7 +22,7 @@ __all__ = ["ClientSet"]
 logger = logging.getLogger("rosasync")
 
 EVICT_MIN = 0.05
-"""Least seconds between two looks for idle clients."""
+"""Minimum number of seconds between two checks for idle clients."""
 
 
 class ClientSet:
@@ -30,12 +30,12 @@ class ClientSet:
 
     Args:
         service: the service.
-        node: creates the clients, and knows the servers.
-        limits: how many clients there may be, and for how long unused.
-        watch: tells the generation of the graph.
-        errors: of the service.
+        node: creates the clients, and counts and identifies the servers.
+        limits: how many clients there may be, and how long an idle one is kept.
+        watch: counts the generations of the graph.
+        errors: makes the errors of the service's calls.
         on_capacity: called when a place in a client's window becomes free.
-        has_callers: returns whether callers wait for a client; none is evicted then.
+        has_callers: returns whether callers wait for a client. If so, no client is evicted.
     """
 
     def __init__(
@@ -58,24 +58,27 @@ class ClientSet:
         self._has_callers = has_callers
         self._loop = asyncio.get_running_loop()
         self._clients: list[Client] = []
-        # Runs while there are clients.
+        # The first client starts it. It stops when no client is left.
         self._evict_timer: asyncio.TimerHandle | None = None
+        # The highest count so far, so that each further server is reported once.
         self._servers_counted = 1
-        # The generations of the graph in which the servers were queried last, and lost ones sought.
+        # The generations of the graph in which the servers were last queried, and in which requests
+        # without servers were last searched for.
         self._servers_generation = -1
         self._lost_generation = -1
+        # Whether the warning was logged since a client was last created.
         self._growth_failed = False
 
     def __len__(self) -> int:
         return len(self._clients)
 
     def __iter__(self) -> Iterator[Client]:
-        # A copy: to look at a client may show that it was destroyed, and remove it.
+        # A copy, because checking a client removes it if it turns out to be destroyed.
         return iter(tuple(self._clients))
 
     @property
     def capacity(self) -> int:
-        """How many more requests fit into the windows, of clients that are not matched too."""
+        """How many more requests fit into the windows of all clients, matched or not."""
         return sum(max(client.capacity, 0) for client in self._clients)
 
     @property
@@ -90,12 +93,12 @@ class ClientSet:
 
     @property
     def idle(self) -> int:
-        """The number of clients that carry nothing."""
+        """The number of idle clients."""
         return sum(client.is_idle for client in self._clients)
 
     @property
     def awaits_match(self) -> bool:
-        """Whether a client with capacity is not known to be matched."""
+        """Whether there is a client with capacity that is not known to be matched."""
         generation = self._watch.generation
         return any(
             client.capacity > 0 and client.matched_generation != generation
@@ -126,7 +129,7 @@ class ClientSet:
         client.matched_generation = generation
         self._warn_of_several_servers()
         if self._servers_generation != generation:
-            # The query takes 0.3 ms: not while the caller waits to send.
+            # In a later turn, because the query takes 0.3 ms and the caller is about to send.
             self._servers_generation = generation
             for each in self._clients:
                 each.servers = None
@@ -138,7 +141,7 @@ class ClientSet:
         return any(self.is_matched(client) for client in self)
 
     def has_lost_requests(self) -> bool:
-        """Return whether a request has lost all its servers, also if others have come."""
+        """Return whether a request has lost all its servers, even if there are new ones."""
         if self.servers_gone():
             return True
         if self._lost_generation == self._watch.generation:
@@ -148,7 +151,7 @@ class ClientSet:
         return any(client.has_lost(servers) for client in self)
 
     def servers_gone(self) -> bool:
-        """Return whether no server that fits is left."""
+        """Return whether no fitting server is left; other servers of the name do not count."""
         if not self._node.count_servers(self._service):
             return True
         if any(self._is_ready(client) for client in self):
@@ -156,7 +159,7 @@ class ClientSet:
         return not self._node.find_servers(self._service)
 
     def fail_lost(self, error: Callable[[], Exception]) -> None:
-        """End the calls whose servers have vanished, although others have come."""
+        """End the calls whose servers are all gone, even if there are new ones."""
         servers = self._node.find_servers(self._service)
         for client in self:
             client.fail_lost(servers, error)
@@ -176,7 +179,7 @@ class ClientSet:
             if not self._growth_failed:
                 self._growth_failed = True
                 logger.warning(
-                    "%s: no further client can be created, and the calls share %d: %s",
+                    "%s: no further client can be created, so all calls share %d: %s",
                     self._service.key.srv_name,
                     len(self._clients),
                     error,
@@ -210,7 +213,7 @@ class ClientSet:
                 self._on_capacity()
 
     def drop(self, client: Client) -> None:
-        """Remove a client that was destroyed by other means, such as ``Node.destroy_client``."""
+        """Remove a client that other code has destroyed, for example by ``Node.destroy_client``."""
         if client in self._clients:
             self._clients.remove(client)
             client.fail(self._errors.client_destroyed)
@@ -231,7 +234,7 @@ class ClientSet:
         self._clients.clear()
 
     def _learn_servers(self) -> None:
-        with self._watch.shutdown_noticed():
+        with self._watch.reports_shutdown():
             servers = self._node.find_servers(self._service)
             for client in self:
                 client.learn_servers(servers)
@@ -244,7 +247,7 @@ class ClientSet:
             return False
 
     def _warn_of_several_servers(self) -> None:
-        # The count is cheap, and never too low: only a new maximum is worth the query.
+        # The count is cheap and never too low, so only a new maximum needs the expensive query.
         counted = self._node.count_servers(self._service)
         if counted <= self._servers_counted:
             return

@@ -1,4 +1,4 @@
-"""What an open session consists of, and its one end."""
+"""The parts of an open session, and how they end together."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ __all__ = ["Core", "OpenNode"]
 logger = logging.getLogger("rosasync")
 
 END_TIMEOUT = 5.0
-"""Seconds for a callback of the node to end with the session, before its thread is left behind."""
+"""Seconds to wait for a running callback of the node before its thread is left behind."""
 
 OpenNode = Callable[[LoopGateway, Callable[[], None], Callable[[], None]], "NodePort"]
-"""Opens a node, given the gateway, and what to call when the graph changes and the context ends."""
+"""Opens a node. Takes the gateway, and the callbacks for graph changes and context shutdown."""
 
 
 class Core:
@@ -54,6 +54,7 @@ class Core:
             self.node, self.arguments, options.limits, options.timeout, self._context_shut_down
         )
         self.portal = Portal(self.node, self.gateway, self.arguments, self.pool, options.timeout)
+        # A server removes itself when it ends, by its `on_end`.
         self.servers: dict[ServiceServer[Any, Any], None] = {}
         self.closed = False
         self._session = weakref.ref(session)
@@ -83,7 +84,7 @@ class Core:
         return server
 
     async def aclose(self) -> None:
-        """End everything, once. All callers wait for the same end."""
+        """End everything; idempotent. All callers wait for the same task."""
         self.closed = True
         # Before the task is created, because an eager one closes the servers at once.
         for server in self.servers:
@@ -120,7 +121,7 @@ class Core:
         self._cleaned_up.set()
 
     def _exit(self) -> None:
-        """End the executor thread when the interpreter exits, which would abort on it."""
+        """End the executor thread, because the interpreter aborts if it exits while one spins."""
         session = self._session()
         if session is not None and not self.closed:
             self.closed = True

@@ -47,7 +47,7 @@ def wrap_future(future: Any) -> asyncio.Future[Any]:
             wrapped.set_result(future.result())
 
     def on_done(_: Any) -> None:
-        # After the loop was closed, there is no one to wait for it.
+        # If the loop is closed, nothing waits for the result any more.
         with contextlib.suppress(RuntimeError):
             loop.call_soon_threadsafe(arrive)
 

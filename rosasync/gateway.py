@@ -31,10 +31,10 @@ class LoopGateway:
     def __init__(self) -> None:
         self.loop = asyncio.get_running_loop()
         self._thread = threading.get_ident()
-        # Reentrant, because the garbage collector may run any __del__ inside `post`.
+        # Reentrant, because the garbage collector may run a __del__ that posts inside `post`.
         self._lock = threading.RLock()
         self._calls: list[tuple[Callable[..., object], tuple[Any, ...]]] = []
-        # Changed by single operations only, which are atomic.
+        # Needs no lock: each change is a single operation, which is atomic.
         self._pending: dict[Pending, None] = {}
         self._closed = False
 
@@ -76,7 +76,7 @@ class LoopGateway:
                 try:
                     self.loop.call_soon_threadsafe(self._drain)
                 except RuntimeError:
-                    # The loop was closed by its own thread in between.
+                    # The loop was closed, on its own thread, since the check.
                     self._calls.clear()
             self.check_open()
 
@@ -86,7 +86,7 @@ class LoopGateway:
             self.post(callback, *args)
 
     def call(self, callback: Callable[..., object], *args: Any) -> None:
-        """Call ``callback(*args)`` at once on the loop's thread, otherwise as `post` does."""
+        """Call ``callback(*args)`` at once if this is the loop's thread; otherwise `post` it."""
         if self.on_loop:
             self.check_open()
             callback(*args)

@@ -15,12 +15,12 @@ if TYPE_CHECKING:
 __all__ = ["GraphWatch", "Watcher"]
 
 POLL_MIN = 0.002
-"""Seconds until a new client is first polled: matching it with a server takes milliseconds."""
+"""Seconds until the first poll for a match, which takes milliseconds."""
 POLL_MAX = 0.25
-"""Most seconds between two polls while callers wait for a match."""
+"""Maximum number of seconds between two polls while callers wait for a match."""
 POLL_CONTEXT = 0.5
-"""Seconds between two polls of the context while requests are outstanding: rclpy's signal handler
-shuts it down without an event."""
+"""Seconds between two polls of the context while requests are outstanding. They are needed because
+rclpy's signal handler shuts a context down without an event."""
 
 
 class Watcher(Protocol):
@@ -35,7 +35,7 @@ class Watcher(Protocol):
         """Whether callers wait for a client to be matched."""
 
     def on_graph(self) -> None:
-        """Look at the graph again.
+        """Check the graph again.
 
         Raises:
             ContextShutdown: the node is down.
@@ -43,12 +43,12 @@ class Watcher(Protocol):
 
 
 class GraphWatch:
-    """Tells the services of a pool when to look at the graph again.
+    """Makes the services of a pool check the graph again when it may have changed.
 
-    Confined to the loop's thread. A change of the graph begins a new generation, in which every
-    client has to prove again that it is matched. The match itself is no event of the graph, so
-    there is one timer for all services: it starts when a caller waits for a match or a request is
-    sent, and stops when a poll finds neither callers nor requests.
+    Confined to the loop's thread. A change of the graph begins a new generation, in which the match
+    of every client is checked again. A match is not an event of the graph, so one timer for all
+    services polls for it. The timer starts when a caller waits for a match or a request is sent,
+    and stops when a poll finds neither callers nor requests.
 
     Attributes:
         generation: counts the changes of the graph.
@@ -81,7 +81,7 @@ class GraphWatch:
             self.poll_soon()
 
     def advance(self) -> None:
-        """Begin a new generation without looking at the services."""
+        """Begin a new generation without checking the services."""
         self.generation += 1
 
     def poll_soon(self) -> None:
@@ -118,7 +118,7 @@ class GraphWatch:
             return
         if not self._node.graph_events:
             self.advance()
-        # It still counts as polling: a dispatch of the services would start the slow timer.
+        # `polling` stays set during this, because a dispatch would start the slow timer otherwise.
         try:
             self._check_services()
         finally:
@@ -136,14 +136,14 @@ class GraphWatch:
             self.polling = False
 
     @contextmanager
-    def shutdown_noticed(self) -> Iterator[None]:
-        """Take a `ContextShutdown` of the block as the news that it is, not as an error."""
+    def reports_shutdown(self) -> Iterator[None]:
+        """Report a `ContextShutdown` that the block raises, and suppress it."""
         try:
             yield
         except ContextShutdown:
             self._on_shutdown()
 
     def _check_services(self) -> None:
-        with self.shutdown_noticed():
+        with self.reports_shutdown():
             for service in tuple(self._services):
                 service.on_graph()

@@ -1,4 +1,4 @@
-"""Handlers of a server: their kinds, running them and their hooks, and their tasks."""
+"""The handlers of a server: their kinds, how they and the hooks run, and their tasks."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ inherit it."""
 
 
 class HandlerTasks:
-    """The tasks of a server's handlers, for its end to wait for. Confined to the loop's thread.
+    """The tasks of a server's handlers, which its end waits for. Confined to the loop's thread.
 
     A handler that waits for the end itself, by closing its server or its session, is neither waited
     for nor cancelled: it would deadlock.
@@ -65,7 +65,7 @@ class HandlerTasks:
         self._loop = asyncio.get_running_loop()
         self._tasks: set[asyncio.Task[None]] = set()
         self._closers: set[asyncio.Task[Any]] = set()
-        # Pending while `wait` waits; completed if the set of closers grows meanwhile.
+        # Wakes `wait` when `_closers` grows, because it must not wait for a closer.
         self._closer_added: asyncio.Future[None] | None = None
 
     def __len__(self) -> int:
@@ -86,7 +86,7 @@ class HandlerTasks:
                 self._closer_added.set_result(None)
 
     async def wait(self, deadline: float | None) -> None:
-        """Wait until every task is done, or until this time of the loop's."""
+        """Wait until every task is done, or until ``deadline`` in loop time (None: no deadline)."""
         while tasks := self._pending():
             left = None if deadline is None else deadline - self._loop.time()
             if left is not None and left <= 0:
@@ -106,7 +106,7 @@ class HandlerTasks:
             self._loop.call_soon(task.cancel)
 
     def _pending(self) -> set[asyncio.Task[None]]:
-        # A task that is cancelled before it begins, by something else, never leaves the set itself.
+        # A task that other code cancels before it begins never removes itself from the set.
         return {task for task in self._tasks - self._closers if not task.done()}
 
     async def _run(self, work: Coroutine[Any, Any, None]) -> None:
@@ -118,11 +118,11 @@ class HandlerTasks:
         try:
             await work
         except (KeyboardInterrupt, SystemExit):
-            # The loop raises them, so the task need not report them once more.
+            # The loop raises it. Retrieve it, so that the task does not log it as well.
             task.add_done_callback(asyncio.Task.exception)
             raise
         finally:
-            # The task's own context would keep the task alive.
+            # Otherwise the task and its context keep each other alive.
             _handler_task.set(None)
             self._tasks.discard(task)
             self._closers.discard(task)
@@ -133,7 +133,7 @@ class HandlerKind(Generic[RequestT, ResponseT]):
     """How to run a handler.
 
     Attributes:
-        invoke: calls the handler with what it takes.
+        invoke: calls the handler with the arguments that it takes.
         may_defer: whether it may return None, to respond later.
     """
 
@@ -144,15 +144,15 @@ class HandlerKind(Generic[RequestT, ResponseT]):
 class HandlerRunner(Generic[RequestT, ResponseT]):
     """Runs the handler and the hooks of a server, and settles their calls.
 
-    Confined to the loop's thread. It contains every exception that they raise, except those that
-    end the program, such as KeyboardInterrupt.
+    Confined to the loop's thread. Exceptions of handlers and hooks do not leave it, except those
+    that end the program, such as KeyboardInterrupt.
 
     Args:
         kind: how to run the handler; None if the calls are iterated over.
         on_error: the hook for handlers that failed.
-        sender: what sends the responses.
-        counts: where handlers that defer or fail are counted.
-        tasks: where async handlers run.
+        sender: sends the responses.
+        counts: counts the handlers that defer or fail.
+        tasks: runs the async handlers.
         on_finished: called when an async handler has finished.
 
     Attributes:

@@ -1,4 +1,4 @@
-"""Limits, Retry, the options of a session, and the checks of their values."""
+"""Limits, Retry and the options of a session, and the checks of their values."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ __all__ = [
 
 
 def check_seconds(name: str, value: SupportsFloat) -> float:
-    """Return ``value``, any real number but a bool, as a float.
+    """Return ``value`` as a float. It may be any real number except a bool.
 
     Raises:
         TypeError: it is not a number.
@@ -56,7 +56,7 @@ def check_timeout(value: Timeout, default: float | None) -> float | None:
 
 
 def check_count(name: str, value: SupportsIndex, least: int) -> int:
-    """Return ``value``, any whole number but a bool, as an int of at least ``least``.
+    """Return ``value`` as an int. It may be any whole number from ``least`` on, except a bool.
 
     Raises:
         TypeError: it is not a whole number.
@@ -101,22 +101,23 @@ class Limits:
     """What the pool may use for each service.
 
     By default one client carries at most ten requests at once, because a stock server queues ten
-    and silently drops the rest. All clients of the server share that queue, those of other
-    processes too. So each client's window is its share: ``server_depth`` divided by the number of
+    and silently drops the rest. All clients of the server share that queue, including those of
+    other processes. So each client gets its share: ``server_depth`` divided by the number of
     clients that the graph shows, and at least one.
 
     ``Limits(clients=8, in_flight=1)`` gives each call a client of its own.
 
     Attributes:
-        clients: most rclpy clients for each service.
-        in_flight: most outstanding requests for each client. A request that was cancelled or timed
-            out counts until the server has dealt with it, see ``grace``.
-        waiting: most callers that wait for each service; further callers get `PoolFull`.
+        clients: the maximum number of rclpy clients for each service.
+        in_flight: the maximum number of outstanding requests for each client. A request that was
+            cancelled or timed out counts until the server has dealt with it, see ``grace``.
+        waiting: the maximum number of callers that wait for each service; further callers get
+            `PoolFull`.
         idle: seconds after which an unused client is destroyed.
         grace: seconds for which a cancelled or timed-out request counts as outstanding, unless its
             late response arrives sooner. It may still be in the server's queue.
-        server_depth: the depth of the server's queue, which all clients of the name share; None if
-            it is known to be deep, so that a client need not share it.
+        server_depth: the depth of the server's queue, which all clients of the name share. None if
+            it is deep enough for all of them, so that each may use its whole ``in_flight``.
 
     Raises:
         TypeError: a value is not a number.
@@ -140,7 +141,7 @@ class Limits:
             _set(self, "server_depth", check_count("server_depth", self.server_depth, 1))
 
     def window(self, clients: int) -> int:
-        """Return the window of a client, if the graph shows this number of clients."""
+        """Return the window of each client, given the number of clients in the graph."""
         if self.server_depth is None:
             return self.in_flight
         return min(self.in_flight, max(1, self.server_depth // max(1, clients)))
@@ -150,12 +151,12 @@ class Limits:
 class Retry:
     """When to send an unanswered request again; only for services that may run twice.
 
-    The first answer to any attempt wins. The deadline is still that of the whole call.
+    The first response to any attempt wins. The deadline still covers the whole call.
 
     Attributes:
-        attempts: how often the request is sent at most, including the first time.
-        after: seconds to wait for an answer before the second attempt.
-        backoff: the factor by which that wait grows with each further attempt.
+        attempts: the maximum number of times the request is sent, including the first.
+        after: seconds to wait for a response before the second attempt.
+        backoff: the factor by which this wait grows with each further attempt.
 
     Raises:
         TypeError: a value is not a number.

@@ -30,9 +30,9 @@ __all__ = ["ClientPool", "LeasedClient"]
 
 
 class ClientPool:
-    """Hands out clients for each service, and takes them back after each call.
+    """Leases clients for each service, and takes them back after each call.
 
-    A session's, as ``session.pool``. Use it on the loop's thread.
+    The pool of a session is ``session.pool``. Use it on the loop's thread.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class ClientPool:
         self._timeout = timeout
         self._opened = self._loop.time()
         self._services: dict[ServiceKey, ServicePool] = {}
-        # The services by their arguments as given, without describing them again.
+        # Repeated calls find their service here by the type and name as given, unresolved.
         self._shortcuts: dict[tuple[Any, str], ServicePool] = {}
         self._deadlines = Deadlines()
         self._watch = GraphWatch(node, self._services.values(), on_shutdown)
@@ -126,7 +126,7 @@ class ClientPool:
         Args:
             srv_type: a service class or its name.
             srv_name: the service's name.
-            clients: how many clients there are to be, at most `Limits.clients`.
+            clients: the number of clients to have, at most `Limits.clients`.
 
         Raises:
             ValueError: more clients than `Limits.clients` allows.
@@ -155,7 +155,8 @@ class ClientPool:
         """Return the pool of one service, created at its first use.
 
         Raises:
-            TypeError, ValueError: the service type does not exist, or the QoS is none.
+            TypeError, ValueError: the service type does not exist, or the QoS is not a
+                ``QoSProfile``.
             InvalidServiceName: ROS does not allow the name.
             SessionClosed, ContextShutdown: the session has ended.
         """
@@ -183,7 +184,7 @@ class ClientPool:
         return pool
 
     def graph_changed(self) -> None:
-        """Tell the services that the ROS graph has changed."""
+        """Make the services check the ROS graph again, because it has changed."""
         self._watch.changed()
 
     def check_open(self) -> None:
@@ -194,7 +195,7 @@ class ClientPool:
     def end(self, ending: Callable[[], Exception]) -> None:
         """End every call with the error that ``ending`` makes, and destroy the clients.
 
-        If it is called again, later calls get the new error.
+        If it is called again, calls made afterwards get the new error.
         """
         self._ending = ending
         self._watch.close()
@@ -240,8 +241,9 @@ class LeasedClient(Generic[RequestT, ResponseT]):
             UsageError: the lease has ended, or another call of it is in progress.
         """
         if self.closed or self._busy:
-            state = "is over" if self.closed else "carries one call at a time"
-            raise UsageError(f"{self._service.service.key.srv_name}: the lease {state}")
+            name = self._service.service.key.srv_name
+            problem = "is over" if self.closed else "carries one call at a time"
+            raise UsageError(f"{name}: the lease {problem}: take another one")
         self._busy = True
         try:
             service = self._service

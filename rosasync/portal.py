@@ -1,4 +1,4 @@
-"""Portal: calls from other threads than the loop's, as ``session.from_thread``."""
+"""Portal: calls from threads other than the loop's, as ``session.from_thread``."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ if TYPE_CHECKING:
 __all__ = ["Portal"]
 
 POLL_LOOP = 0.5
-"""Seconds between two polls of a blocked thread whether its loop still exists."""
+"""Seconds after which a blocked thread checks again whether the loop has been closed."""
 
 MARGIN = 1.0
 """Seconds after its deadline for which a blocked thread waits for the loop to report it."""
 
 
 class Portal:
-    """Calls services from other threads than the loop's: ``session.from_thread``.
+    """Calls services from threads other than the loop's: ``session.from_thread``.
 
     For worker threads, GUI toolkits and libraries that block; in the loop, use `Session.call`. On
     the loop's own thread, and on the session's executor thread (which runs the node's callbacks), a
-    call would deadlock and raises `UsageError`. If somebody else's executor spins the node, do not
-    block in its callbacks either.
+    call would deadlock and raises `UsageError`. If another executor spins the node, do not block in
+    its callbacks either.
     """
 
     def __init__(
@@ -195,8 +195,7 @@ class Portal:
 class _Submission(Future[Any]):
     """A call that another thread waits for.
 
-    It is completed by the loop, by the end of the session, or by its cancellation, whichever comes
-    first.
+    The loop, the end of the session and a cancellation may each complete it. The first one wins.
     """
 
     def __init__(
@@ -252,7 +251,7 @@ class _Submission(Future[Any]):
     def wait(self) -> Any:
         """Return the response, at most `MARGIN` seconds after the deadline.
 
-        Whatever else ends the wait, such as a KeyboardInterrupt, cancels the call.
+        If the wait ends otherwise, for example by a KeyboardInterrupt, the call is cancelled.
         """
         try:
             self._watch(None if self._timeout is None else self._timeout + MARGIN)
@@ -272,7 +271,7 @@ class _Submission(Future[Any]):
         )
 
     def _watch(self, timeout: float | None) -> None:
-        """Wait for the end, for ``timeout`` seconds at most, or for the end of the loop."""
+        """Wait until this is done, the loop is closed, or ``timeout`` seconds have passed."""
         ends = None if timeout is None else time.monotonic() + timeout
         while not self.done():
             left = POLL_LOOP if ends is None else min(POLL_LOOP, ends - time.monotonic())
@@ -284,10 +283,10 @@ class _Submission(Future[Any]):
                 self.fail(SessionClosed("the session's loop was closed"))
 
     def _on_done(self, _: Future[Any]) -> None:
-        """Cancel the call if the future was cancelled; runs once, on the thread that ended it."""
+        """Cancel the call if the future was cancelled. Runs once, on the thread that ended it."""
         self._gateway.discard(self)
         if self.cancelled():
-            # concurrent.futures.wait and as_completed look at this.
+            # concurrent.futures.wait and as_completed see the cancellation only now.
             self.set_running_or_notify_cancel()
             with contextlib.suppress(SessionClosed):
                 self._gateway.call(self._cancel)

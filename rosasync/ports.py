@@ -1,4 +1,4 @@
-"""What the core needs of rclpy, as protocols: the real ports are in `rosasync.ros`."""
+"""Protocols for what the core needs from rclpy; `rosasync.ros` implements them."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Servers = frozenset[Hashable]
 
 
 class PortDestroyed(Exception):
-    """The rclpy client or service was destroyed by something else than rosasync."""
+    """The rclpy client or service was destroyed by something other than rosasync."""
 
 
 class Undeliverable(Exception):
@@ -61,7 +61,7 @@ class Service:
 
 
 class RequestId(Protocol):
-    """The identity of a request. rclpy shows the number, but not the client."""
+    """The identity of a request. rclpy exposes its number, but not its client."""
 
     @property
     def sequence_number(self) -> int:
@@ -69,7 +69,7 @@ class RequestId(Protocol):
 
 
 class RequestHeader(Protocol):
-    """The header of a request; keep it as it is, to send the response."""
+    """The header of a request. Keep the object: it is needed to send the response."""
 
     @property
     def request_id(self) -> RequestId:
@@ -104,11 +104,11 @@ class ServicePort(Protocol):
 
     @property
     def destroy_delay(self) -> float:
-        """Seconds to wait between `stop` and `close`, if there is time."""
+        """Seconds to wait between `stop` and `close`, unless the server has to end at once."""
 
     @property
     def destroyed(self) -> bool:
-        """Whether something else than rosasync has destroyed the service."""
+        """Whether something other than rosasync has destroyed the service."""
 
     def send(self, header: RequestHeader, response: Any) -> None:
         """Convert and send a response. From any thread, but not during or after `close`.
@@ -218,7 +218,7 @@ class NodePort(Protocol):
         """
 
     def count_clients(self, service: Service) -> int:
-        """Return how many clients have the service's name, of all processes. Cheap.
+        """Return how many clients have the service's name, in all processes. Cheap.
 
         Raises:
             ContextShutdown: the node is down.
@@ -227,7 +227,7 @@ class NodePort(Protocol):
     def find_servers(self, service: Service) -> Servers:
         """Identify the servers that fit: by name, type and QoS.
 
-        If the middleware does not tell servers apart, there is a placeholder for each server of
+        If the middleware does not identify servers, the set has a placeholder for each server of
         the name.
 
         Raises:

@@ -27,14 +27,14 @@ class ProxyState(enum.Enum):
     """The state of the last operation of an `AsyncServiceProxy`.
 
     Attributes:
-        IDLE: there was none yet, or its response has been read.
+        IDLE: there was no operation yet, or its response has been read.
         WAITING: it waits for a server.
-        SERVICE_AVAILABLE: it waited for a server, and there is one.
+        SERVICE_AVAILABLE: it waited for a server and found one.
         RUNNING: a call is in progress: waiting for a server, a client or the response.
         RESPONSE_READY: the response can be read.
         TIMEOUT: the deadline of the call or the wait passed, in any phase.
-        ABORTED: it was stopped before its end, or before its response was read.
-        ERROR: it failed otherwise; `AsyncServiceProxy.get_errors` says how.
+        ABORTED: it was stopped before it ended, or before its response was read.
+        ERROR: it failed with another error; `AsyncServiceProxy.get_errors` returns it.
     """
 
     IDLE = enum.auto()
@@ -48,10 +48,10 @@ class ProxyState(enum.Enum):
 
 
 PENDING = (ProxyState.WAITING, ProxyState.RUNNING)
-"""The loop works on the operation."""
+"""The states in which the loop works on the operation."""
 
 STOPPABLE = (*PENDING, ProxyState.RESPONSE_READY)
-"""Something is in progress, or unread."""
+"""The states that `AsyncServiceProxy.stop_call` ends."""
 
 
 class AsyncServiceProxy(Generic[RequestT, ResponseT]):
@@ -75,8 +75,8 @@ class AsyncServiceProxy(Generic[RequestT, ResponseT]):
     Two states change by themselves: WAITING to SERVICE_AVAILABLE, TIMEOUT or ERROR, and RUNNING to
     RESPONSE_READY, TIMEOUT or ERROR. When the session is closed, both become ERROR.
 
-    A new call or wait replaces the previous operation, which is cancelled. A late response to that
-    is counted and never shown. ``shutdown`` does what ``stop_call`` does, for good.
+    A new call or wait cancels and replaces the previous operation. A late response to that one is
+    counted, and never returned. ``shutdown`` does what ``stop_call`` does, and refuses new calls.
 
     Args:
         session: an open session.
@@ -91,9 +91,10 @@ class AsyncServiceProxy(Generic[RequestT, ResponseT]):
         SessionClosed: the session is closed.
     """
 
-    # `_operation` says what is wanted, and is replaced as a whole. The loop writes only into the
-    # operation it works on. So no lock is needed, and a replaced call cannot show up. After each
-    # replacement the loop reconciles: the last time settles what it works on.
+    # `_operation` is the current operation. Any thread replaces it as a whole, and the loop writes
+    # only into the operation that it works on, `_working`. So no lock is needed, and the result of
+    # a replaced call is never visible. After each replacement the loop reconciles the two. Posts
+    # may be reordered between threads, but the last reconciliation sees the last operation.
     __slots__ = (
         "__weakref__",
         "_arguments",
@@ -137,13 +138,12 @@ class AsyncServiceProxy(Generic[RequestT, ResponseT]):
     ) -> None:
         """Start a call, which replaces the previous operation. The state becomes RUNNING.
 
-        On the loop's thread the request is sent at once if a client is free. Otherwise it is
-        copied. So it may be changed afterwards.
+        On the loop's thread, if a client is free, the request is sent before this returns.
+        Otherwise it is copied. So it may be changed afterwards.
 
         Args:
             request: a message, a mapping of its fields, or None for an empty one.
-            timeout: seconds for the whole call, from now on; None for no deadline; if left out, the
-                session's.
+            timeout: seconds for the whole call; None for no deadline; if left out, the session's.
             wait: False to fail at once if there is no server.
 
         Raises:
@@ -170,7 +170,7 @@ class AsyncServiceProxy(Generic[RequestT, ResponseT]):
         """Wait for a server, which replaces the previous operation. The state becomes WAITING.
 
         Args:
-            timeout: seconds from now on; None for no deadline, ``...`` for the session's.
+            timeout: seconds; None for no deadline, ``...`` for the session's.
 
         Raises:
             TypeError, ValueError: the timeout does not fit; the state is unchanged.
@@ -182,22 +182,22 @@ class AsyncServiceProxy(Generic[RequestT, ResponseT]):
     def stop_call(self) -> None:
         """Stop the operation, in any state.
 
-        What is in progress is cancelled, and an unread response dropped: the state becomes ABORTED.
-        Otherwise it is unchanged.
+        A call or wait in progress is cancelled, an unread response is dropped, and the state
+        becomes ABORTED. In the other states nothing changes.
         """
         if self._operation.state in STOPPABLE:
             self._replace(_Operation(ProxyState.ABORTED))
 
     def get_state(self) -> ProxyState:
-        """Return the state. This only reads an attribute."""
+        """Return the state. Cheap: it only reads an attribute."""
         return self._operation.state
 
     def get_response(self) -> ResponseT | None:
-        """Return the response once, and become IDLE. Return None if there is none to read."""
+        """Return the response and become IDLE; return None if there is no unread response."""
         operation = self._operation
         if operation.state is not ProxyState.RESPONSE_READY:
             return None
-        # The loop has finished with it.
+        # The loop does not write into a finished operation, so this thread may.
         operation.state = ProxyState.IDLE
         response, operation.response = operation.response, None
         return cast(ResponseT, response)
@@ -217,7 +217,7 @@ class AsyncServiceProxy(Generic[RequestT, ResponseT]):
             raise UsageError(f"{self._service.key.srv_name}: the proxy was shut down")
         self._replace(operation)
         if self._closed:
-            # Another thread has shut it down in between.
+            # Another thread has shut the proxy down since the check.
             self.stop_call()
 
     def _replace(self, operation: _Operation) -> None:
@@ -238,7 +238,7 @@ class AsyncServiceProxy(Generic[RequestT, ResponseT]):
     # On the loop's thread.
 
     def _reconcile(self) -> None:
-        """Cancel the work that is not wanted any more, and start what is wanted."""
+        """Cancel the work on a replaced operation, and start the work on the current one."""
         operation, working = self._operation, self._working
         if operation is working:
             return
@@ -249,7 +249,7 @@ class AsyncServiceProxy(Generic[RequestT, ResponseT]):
             operation.begun = True
             self._working = operation
             loop, work = self._gateway.loop, self._work(operation)
-            # The tick that asks for a call sends it. A wait is always WAITING at first.
+            # A call is sent in the same tick. A wait has to be visible as WAITING first.
             calls = operation.state is ProxyState.RUNNING
             operation.task = start_task(loop, work) if calls else loop.create_task(work)
 
@@ -318,10 +318,11 @@ class _Operation:
         return max(0.0, self.timeout - (time.monotonic() - self.started))
 
     def end(self, state: ProxyState, response: Any = None, error: Exception | None = None) -> None:
-        """Set the outcome, unless there is one; the state last, because other threads read it."""
+        """Set the outcome, unless there is one."""
         if self.state in PENDING:
             self.response = response
             self.error = error
+            # Last, because other threads read it first.
             self.state = state
 
     def fail(self, error: Exception) -> None:

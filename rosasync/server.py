@@ -43,9 +43,9 @@ __all__ = ["Handler", "RequestInfo", "ServiceCall", "ServiceServer"]
 logger = logging.getLogger("rosasync")
 
 CLOSE_TIMEOUT = 5.0
-"""Seconds for handlers to finish when a server is closed."""
+"""Seconds to wait for handlers to finish when a server is closed."""
 CANCEL_TIMEOUT = 1.0
-"""Seconds for a cancelled handler to end, before it is left behind."""
+"""Seconds to wait for cancelled handlers to end, before they are left behind."""
 
 
 class ServiceServer(Generic[RequestT, ResponseT]):
@@ -54,15 +54,15 @@ class ServiceServer(Generic[RequestT, ResponseT]):
     It takes requests as soon as it is created. As an async context manager it is closed at the end
     of the block. If it has no handler, ``async for call in server:`` gives the calls.
 
-    At most ``concurrency`` handlers run at a time. Up to ``backlog`` requests wait for one, in the
-    order in which they came. They are taken out of the middleware meanwhile, so that its queue does
-    not overflow. A plain handler runs in the loop and blocks it for that long; an async one runs in
+    At most ``concurrency`` handlers run at a time. Up to ``backlog`` requests wait their turn, in
+    the order of their arrival. They wait in Python, because the queue of the middleware would
+    overflow. A plain handler runs in the loop, and blocks it until it returns. An async one runs in
     a task.
 
     Confined to the loop's thread, except `ServiceCall.respond`: responses are sent from any thread,
-    several at once, and the service is destroyed only when none is being sent. rcl forbids to take
-    requests and send responses of one service at the same time in different threads. This cannot
-    happen, because rclpy holds the GIL in both.
+    several at once, and the service is destroyed only when none is being sent. rcl does not allow
+    one thread to take requests of a service while another sends responses. This cannot happen,
+    because rclpy holds the GIL during both.
     """
 
     def __init__(
@@ -94,7 +94,7 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         self._end_task: asyncio.Task[None] | None = None
         # Whether `_start_waiting` is active, so that it is not entered again.
         self._starting = False
-        # Whether the warning about dropped requests was logged since a waiting one was started.
+        # Whether the warning about dropped requests was logged since the backlog last shrank.
         self._overload_logged = False
         service = node.describe(srv_type, srv_name, qos)
         self._name, self._type_name, _ = service.key
@@ -141,7 +141,7 @@ class ServiceServer(Generic[RequestT, ResponseT]):
             UsageError: the server has a handler, or runs in another loop.
         """
         if self._has_handler:
-            raise UsageError(f"{self._name}: the calls go to its handler")
+            raise UsageError(f"{self._name}: a server with a handler cannot be iterated over")
         self._check_loop("iterated over")
         call = await self._queue.get()
         self._overload_logged = False
@@ -154,7 +154,7 @@ class ServiceServer(Generic[RequestT, ResponseT]):
 
     @property
     def srv_name(self) -> str:
-        """The resolved service name, also after the end."""
+        """The resolved service name. Also available after the end."""
         return self._name
 
     @property
@@ -169,7 +169,7 @@ class ServiceServer(Generic[RequestT, ResponseT]):
 
     @property
     def qos(self) -> Any:
-        """The ``QoSProfile`` in use: a snapshot, also after the end."""
+        """A snapshot of the ``QoSProfile`` in use. Also available after the end."""
         return self._qos
 
     @property
@@ -221,21 +221,21 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         self._check_loop("closed")
         if self._ended:
             return
-        # Before the task is created, because an eager one looks for handlers to wait for at once.
+        # First, because an eager task collects the handlers to wait for as it is created.
         self.exclude_caller()
         if self._end_task is None:
             self._end_task = self._loop.create_task(self._end(seconds))
         await until_done(self._end_task)
 
     def exclude_caller(self) -> None:
-        """Do not wait for the handler that calls this when the server ends.
+        """Exclude the calling handler from those that the end of the server waits for.
 
         For the session: a handler that closes its session would otherwise wait for itself.
         """
         self._tasks.exclude_caller()
 
     def check_port(self) -> None:
-        """End the server if something else than rosasync has destroyed its rclpy service.
+        """End the server if something other than rosasync has destroyed its rclpy service.
 
         For the session, whenever the graph changes. On the loop's thread.
         """
@@ -280,8 +280,8 @@ class ServiceServer(Generic[RequestT, ResponseT]):
             self._overload(call)
 
     def _start_waiting(self) -> None:
-        # An eager task (Python 3.12) may finish its handler inside `start`, which calls this again:
-        # a long backlog would exceed the recursion limit. The loop here goes on instead.
+        # An eager task (Python 3.12) may finish its handler inside `start`, which calls this again.
+        # With a long backlog that would exceed the recursion limit, so the outer call goes on.
         if self._starting:
             return
         self._starting = True
@@ -303,7 +303,7 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         if call.give_up("dropped: too many requests were waiting") and not self._overload_logged:
             self._overload_logged = True
             logger.warning(
-                "%s: %d requests wait already, and more are dropped unanswered (%d so far)",
+                "%s: %d requests wait already, so further ones are dropped unanswered (%d so far)",
                 self._name,
                 len(self._queue),
                 self._counts.dropped,
@@ -313,7 +313,9 @@ class ServiceServer(Generic[RequestT, ResponseT]):
 
     def _check_loop(self, verb: str) -> None:
         if asyncio._get_running_loop() is not self._loop:
-            raise UsageError(f"{self._name}: a server is {verb} in the loop that serves")
+            raise UsageError(
+                f"{self._name}: a server can only be {verb} in the loop that serves it"
+            )
 
     def _on_destroyed(self) -> None:
         self.end(functools.partial(service_destroyed, self._name))
@@ -365,9 +367,9 @@ class _CallQueue(Generic[RequestT, ResponseT]):
         self._limit = limit
         self._numbers = itertools.count()
         self._closed = False
-        # Each with its place in the order of arrival.
+        # Each with a number in the order of arrival, by which `_put_back` finds its place.
         self._calls: deque[tuple[int, ServiceCall[RequestT, ResponseT]]] = deque()
-        # Completed with an entry of `_calls`, or with None at the end.
+        # Each is completed with an entry of `_calls`, or with None when the queue is closed.
         self._getters: deque[
             asyncio.Future[tuple[int, ServiceCall[RequestT, ResponseT]] | None]
         ] = deque()
@@ -379,7 +381,7 @@ class _CallQueue(Generic[RequestT, ResponseT]):
         """Pass a call to the iterator that waits longest, or keep it.
 
         Returns:
-            False if as many calls as allowed wait already.
+            False if the queue is full.
         """
         entry = next(self._numbers), call
         if self._hand_out(entry):
@@ -405,8 +407,8 @@ class _CallQueue(Generic[RequestT, ResponseT]):
         try:
             entry = await getter
         except BaseException:
-            # A cancelled task, or one whose coroutine is closed. It may have been given a call
-            # before, and it may have been passed over already.
+            # The task was cancelled, or its coroutine closed. The getter may still be queued, may
+            # have been removed by `_hand_out`, or may have received a call just before.
             if not getter.done():
                 getter.cancel()
             if getter.cancelled():
@@ -418,7 +420,7 @@ class _CallQueue(Generic[RequestT, ResponseT]):
         return None if entry is None else entry[1]
 
     def close(self) -> None:
-        """Have iterators end as soon as no call waits; idempotent."""
+        """End the iterators once no call is left; idempotent."""
         self._closed = True
         while self._getters:
             getter = self._getters.popleft()
@@ -434,7 +436,7 @@ class _CallQueue(Generic[RequestT, ResponseT]):
         return False
 
     def _put_back(self, entry: tuple[int, ServiceCall[RequestT, ResponseT]]) -> None:
-        """Pass a call to the next iterator, or keep it in its place, also beyond the limit."""
+        """Pass a call to the next iterator, or put it back in its place, even beyond the limit."""
         if self._closed:
             entry[1].give_up("dropped: the server was closed")
         elif not self._hand_out(entry):

@@ -29,9 +29,9 @@ RESEND = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 1.6, 1.6, 1.6, 1.6)
 """Seconds to wait before each further attempt to send a response to a client that the middleware
 has not discovered completely."""
 MAX_UNSENT = 1000
-"""Most responses of a server that wait to be sent again."""
+"""Maximum number of responses of a server that wait to be sent again."""
 LATE = 0.1
-"""Seconds after which the client of a request may be gone, so that the graph is checked."""
+"""Seconds after which the graph is checked for a client, because it may have left."""
 
 _ANSWERED = "answered"
 
@@ -52,7 +52,7 @@ class RequestInfo:
 
 
 class ServiceCall(Generic[RequestT, ResponseT]):
-    """One request, and the means to answer it, once.
+    """One request, to be answered once.
 
     Keep it to respond later, in any order, from any task or thread. A call that is dropped
     unanswered is a ``ResourceWarning``.
@@ -159,7 +159,7 @@ class ServiceCall(Generic[RequestT, ResponseT]):
         """Leave the request unanswered for good. From any thread.
 
         Args:
-            reason: what became of the call, for the errors of a later `respond`: "dropped: …".
+            reason: the outcome for the error of a later `respond`, such as "dropped: …".
             failed: whether its handler failed. If not, the call is counted as dropped.
 
         Returns:
@@ -266,7 +266,7 @@ class ResponseSender(Generic[ResponseT]):
             call: the call, for the log.
             header: the header of its request.
             response: the response.
-            late: whether the client may have left meanwhile.
+            late: whether the client may have left since it sent the request.
 
         Raises:
             ContextShutdown: the rclpy service was destroyed.
@@ -312,9 +312,9 @@ class ResponseSender(Generic[ResponseT]):
         """Count a call that was garbage-collected unanswered, in a later turn of the loop.
 
         Returns:
-            False if the server, or the loop, had ended before, so that this is no mistake.
+            False if the server or the loop has ended, so that there is nothing to warn of.
         """
-        # No lock is taken here: the garbage collector runs under locks that threads hold already.
+        # Takes no lock: the garbage collector may run this in a thread that holds one.
         if self.ending is not None:
             return False
         try:
@@ -341,7 +341,7 @@ class ResponseSender(Generic[ResponseT]):
 
     def _count_dropped(self) -> None:
         with self.lock:
-            # `close` counts what is unanswered then.
+            # Otherwise `close` has counted the call.
             if self.ending is None:
                 self._counts.dropped += 1
 
@@ -357,7 +357,8 @@ class ResponseSender(Generic[ResponseT]):
         except Undeliverable as error:
             self.give_up(call, error)
         except PortDestroyed as error:
-            # At once, so that no handler is taken to have failed before the server has ended.
+            # Now, not in the later turn that ends the server: the error that is raised below must
+            # not count as a failure of the handler.
             self.shut(lambda: service_destroyed(self.name))
             with suppress(RuntimeError):
                 self._loop.call_soon_threadsafe(self._on_destroyed)
@@ -383,11 +384,10 @@ class _Unsent:
 
 
 class Resender:
-    """Sends responses again whose clients the middleware has not discovered completely.
+    """Repeats responses whose clients the middleware has not discovered completely.
 
     Confined to the loop's thread. One task serves all responses of a server, and ends when none is
-    left. The first attempt follows soon. Later ones are rarer, because an attempt may block for
-    0.1 s if the port does not know the client yet.
+    left. The delays grow, because an attempt may block the process for 0.1 s.
     """
 
     def __init__(
@@ -398,11 +398,11 @@ class Resender:
         self._sender = sender
         self._spawn = spawn
         self._loop = asyncio.get_running_loop()
-        # In the order in which they came. The task runs as long as there are any.
+        # In the order of their arrival. The task runs while there are any.
         self._unsent: dict[_Unsent, None] = {}
 
     def add(self, unsent: _Unsent) -> None:
-        """Send a response again, for about ten seconds. The oldest is given up beyond MAX_UNSENT.
+        """Repeat a response for about ten seconds. Beyond MAX_UNSENT, the oldest is given up.
 
         Raises:
             RuntimeError: the loop is closed.
@@ -422,7 +422,7 @@ class Resender:
     async def _run(self) -> None:
         try:
             while self._unsent:
-                # No longer than the shortest delay, since responses may be added meanwhile.
+                # The shortest delay, because a response that is added now is due after it.
                 await asyncio.sleep(RESEND[0])
                 now = self._loop.time()
                 for unsent in [unsent for unsent in self._unsent if unsent.due <= now]:
@@ -455,7 +455,7 @@ class Resender:
 
 
 def service_destroyed(name: str) -> ContextShutdown:
-    """Return the error for a service that something else than rosasync has destroyed."""
+    """Return the error for a service that something other than rosasync has destroyed."""
     return ContextShutdown(f"{name}: the rclpy service was destroyed under the server")
 
 

@@ -33,9 +33,9 @@ OnClient = Callable[[Client], None]
 """Called with the client when one is granted."""
 
 GONE_DELAY = 0.02
-"""Seconds for a response that a server sent just before it vanished to arrive."""
+"""Seconds to wait for responses that the last server sent just before it vanished."""
 MATCH_TIMEOUT = 1.0
-"""Seconds for a new client to match a server that the graph already shows."""
+"""Seconds to wait until a new client is matched with a server that the graph already shows."""
 
 
 class ServicePool:
@@ -69,10 +69,10 @@ class ServicePool:
         )
         self._counts = self._clients.counts
         self._queue: OrderedDict[asyncio.Future[Any], OnClient] = OrderedDict()
-        # Callers who wait for a match, and for which client: their leased one, or any (None).
+        # Each caller who waits for a match, with the client to be matched: None for any client.
         self._ready_waiters: dict[asyncio.Future[None], Client | None] = {}
         self._dispatch_scheduled = False
-        # Runs for GONE_DELAY after the last server has vanished.
+        # Started when the last server has vanished; ends the requests after GONE_DELAY.
         self._gone_timer: asyncio.TimerHandle | None = None
         self._ending: Callable[[], Exception] | None = None
 
@@ -133,8 +133,8 @@ class ServicePool:
             timeout: seconds for the whole call, None for no deadline.
             wait: whether to wait for a server if there is none.
             retry: when to send again.
-            leased: send with this client, in the place of its lease.
-            copy: copy the request unless it is sent in this turn, and only once.
+            leased: the leased client to send with. The call uses the place of the lease.
+            copy: copy the request, unless it is sent in this turn of the loop and never again.
 
         Raises:
             Exception: as `Session.call`.
@@ -193,7 +193,7 @@ class ServicePool:
         except Expired:
             raise self._unreached(started) from None
         except BaseException:
-            # Granted in the turn in which the caller was cancelled.
+            # A client was granted in the turn in which the caller was cancelled.
             if waiter.done() and not waiter.cancelled() and waiter.exception() is None:
                 waiter.result().release()
             raise
@@ -218,10 +218,10 @@ class ServicePool:
         """Create clients and match them.
 
         Args:
-            clients: how many there are to be.
-            match_by: the loop time at which to stop waiting for the match.
+            clients: the number of clients to have.
+            match_by: the loop time at which to stop waiting for the matches.
         """
-        # At most so often: a client may be evicted before the next one is created.
+        # Not `while`: it would never end if each client is evicted before the next is created.
         for _ in range(clients):
             self.check_open()
             if len(self._clients) < clients:
@@ -262,7 +262,7 @@ class ServicePool:
         self._clients.close()
 
     def on_graph(self) -> None:
-        """Look at the graph again: the share of the queue, matches, servers that have vanished."""
+        """Check the graph again: the shares of the queue, the matches and the lost servers."""
         self._clients.share_queue()
         if self._queue or self._ready_waiters:
             self._dispatch()
@@ -276,13 +276,13 @@ class ServicePool:
         """Join the queue. ``on_client`` is called when a client is granted and the waiter not done.
 
         Raises:
-            PoolFull: the queue is as long as allowed.
+            PoolFull: the queue is full.
             Exception: there is no client, and none can be created.
         """
         self.check_open()
         waiting = len(self._queue)
         self._clients.grow(waiting + 1)
-        # Callers for whom there is capacity do not count: they wait for a match or a dispatch.
+        # Callers for whom there is capacity wait for a match or a dispatch, so they do not count.
         capacity = self._clients.capacity
         if waiting >= self._limits.waiting + capacity:
             raise self._errors.pool_full(waiting, self._limits.waiting)
@@ -304,13 +304,13 @@ class ServicePool:
 
     def _run_dispatch(self) -> None:
         self._dispatch_scheduled = False
-        with self._watch.shutdown_noticed():
+        with self._watch.reports_shutdown():
             self._dispatch()
             if self.awaits_match:
                 self._watch.poll_soon()
 
     def _dispatch(self) -> None:
-        """Grant clients to the callers who wait, in their order, while there is capacity."""
+        """Grant clients to the waiting callers, in their order, while there is capacity."""
         if self._ending is not None:
             return
         self._wake_ready_waiters()
@@ -328,7 +328,7 @@ class ServicePool:
         try:
             on_client(client)
         except Exception as error:
-            # An error of one caller must not end the grants of the others.
+            # The error is this caller's alone: the dispatch goes on with the others.
             client.release()
             if not waiter.done():
                 waiter.set_exception(error)
@@ -344,9 +344,9 @@ class ServicePool:
                 waiter.set_exception(error)
 
     def _replace_clients(self) -> None:
-        """Create clients for the callers who wait, if others were destroyed by other means.
+        """Create clients for the waiting callers, if something else has destroyed some.
 
-        If that fails, all of them get the error.
+        If that fails, all waiting callers get the error.
         """
         callers = len(self._queue) or bool(self._ready_waiters)
         try:
@@ -364,13 +364,13 @@ class ServicePool:
         return leased.capacity >= 0 and self._clients.is_matched(leased)
 
     async def _wait_until_ready(self, leased: Client | None, deadline: float | None) -> None:
-        """Wait until a client is matched: any, or the leased one with a place in its window.
+        """Wait until any client is matched, or until the leased one is matched and has its place.
 
         Raises:
             Expired: the deadline passed.
         """
         self.check_open()
-        # Between the wake-up and the turn in which it arrives, the session may end.
+        # The session may end, or the place be taken, between the wake-up and this task's turn.
         while not self._is_ready_for(leased):
             waiter: asyncio.Future[None] = self._loop.create_future()
             self._ready_waiters[waiter] = leased
@@ -408,7 +408,7 @@ class ServicePool:
 
     def _end_requests(self) -> None:
         self._gone_timer = None
-        with self._watch.shutdown_noticed():
+        with self._watch.reports_shutdown():
             if self._clients.servers_gone():
                 self._watch.advance()
                 self._clients.fail(_Gone)
@@ -425,13 +425,13 @@ class ServicePool:
         return self._errors.queue_timeout(elapsed, self._counts.in_flight, self._clients.abandoned)
 
     def _count_failure(self, call: Call, error: BaseException, started: float) -> BaseException:
-        """Count a failed call, and return the error in the caller's terms."""
+        """Count a failed call, and return the error to raise to the caller."""
         counts = self._counts
         error = self._translate(call, error, started)
         if isinstance(error, asyncio.CancelledError):
             counts.cancelled += 1
             if call.started and not call.future.cancelled() and call.future.exception() is None:
-                counts.late += 1  # Answered, but its task was cancelled before it resumed.
+                counts.late += 1  # The response came before the cancelled task resumed.
         elif isinstance(error, TimeoutError):
             counts.timed_out += 1
             logger.debug("%s", error)

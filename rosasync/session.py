@@ -56,7 +56,7 @@ class Session:
             direct bridge if it works here.
         limits: what the pool may use for each service.
         timeout: seconds for a call that gives no timeout, None for no deadline.
-        busy_poll: seconds for which the loop looks for a response before it sleeps, as Linux's
+        busy_poll: seconds for which the loop polls for a response before it sleeps, like Linux's
             SO_BUSY_POLL. It halves the latency, and keeps a core busy while a quick service is
             called. 0.0005 suits services on the same machine. Only on the direct bridge.
         introspection: what clients and servers publish about each call, on
@@ -90,7 +90,7 @@ class Session:
             introspection=introspection,
         )
         self._core: Core | None = None
-        # Closed without having been opened; afterwards the core knows.
+        # Whether it was closed before it was opened. Once it is open, `Core.closed` counts.
         self._closed = False
 
     def __repr__(self) -> str:
@@ -161,7 +161,7 @@ class Session:
         return self._core
 
     def statistics(self) -> SessionStatistics:
-        """Take a snapshot of the session's statistics; after the close, of the last ones."""
+        """Take a snapshot of the session's statistics. After the close it shows the final ones."""
         core = self.core
         return SessionStatistics(
             bridge=core.node.bridge,
@@ -231,7 +231,7 @@ class Session:
             TypeError, ValueError: an argument does not fit; nothing was sent.
             UsageError: called from another loop or thread.
         """
-        # As _use does, without the price of another call.
+        # `_use`, inlined, because this runs for every call.
         core = self._core or self._use()
         core.check_loop()
         service = core.pool.service(srv_type, srv_name, qos)
@@ -279,8 +279,8 @@ class Session:
     ) -> asyncio.Task[Any]:
         """Start the same call as a task, for a tick to poll and cancel.
 
-        If a client is free, the request is sent before this returns. Otherwise it is copied first.
-        So it may be changed afterwards.
+        If a client is free, the request is sent before this returns. Otherwise it is copied. So it
+        may be changed afterwards.
 
         For the arguments and errors, see `call`. Wrong arguments raise here, everything later is
         raised by the task.
@@ -366,7 +366,8 @@ class Session:
     ) -> bool:
         """Return whether a server of this service is matched, so that a call is sent at once.
 
-        A service that is asked for the first time takes some milliseconds to be matched.
+        The first query for a service may return False, because it takes some milliseconds to match
+        a new client.
         """
         return self._use().pool.service(srv_type, srv_name, qos).is_ready()
 
@@ -429,11 +430,11 @@ class Session:
                 call is answered with ``call.respond``, now or later. None for
                 ``async for call in server:``. The number of required arguments decides, once, at
                 registration. A plain handler blocks the loop while it runs.
-            concurrency: most handlers that run at a time.
-            backlog: most requests that wait for a handler.
+            concurrency: the maximum number of handlers that run at a time.
+            backlog: the maximum number of requests that wait for a handler.
             qos: a ``QoSProfile``; None for the service default with a history of 1,000.
             on_error: ``on_error(call, error)``, plain or async, called when the handler has raised
-                an exception or returned something else than a response. It may return the response
+                an exception or returned something other than a response. It may return the response
                 to send.
             on_overload: ``on_overload(call)``, plain or async, called for a request beyond the
                 backlog. It may return the response to send. ``concurrency`` does not limit it, so
@@ -473,7 +474,7 @@ class Session:
     def _open_node(
         self, gateway: LoopGateway, on_graph: Callable[[], None], on_shutdown: Callable[[], None]
     ) -> NodePort:
-        """Open the node. A session in memory overrides this."""
+        """Open the node. The session of `rosasync.testing` overrides this."""
         ros_node: type[RosNode] = _import_ros("rosasync.ros.node").RosNode
         return ros_node(self._options, gateway, on_graph, on_shutdown)
 

@@ -35,17 +35,17 @@ class KeyStatistics:
 
     Attributes:
         clients: rclpy clients that exist now.
-        idle: those of them that carry nothing.
+        idle: those of them without leases and outstanding requests.
         in_flight: outstanding requests whose callers still wait.
         waiting: callers that wait for a client.
-        peak: most requests in flight at once (in total: the sum over the services).
+        peak: the maximum of ``in_flight`` so far (in total: the sum over the services).
         created: clients created so far.
         completed: calls answered.
         timed_out: calls whose deadline passed, in any phase.
         cancelled: calls cancelled, in any phase.
         failed: calls that ended with another error, such as `ServerGone` or `SessionClosed`.
         abandoned: requests without a caller that still count as outstanding.
-        window: most requests that all clients together may have outstanding now.
+        window: the maximum number of outstanding requests of all clients together, now.
         late: responses that arrived after their caller had left.
         retried: requests sent again.
     """
@@ -75,7 +75,9 @@ class PoolStatistics(KeyStatistics):
 
 @dataclass(frozen=True, slots=True)
 class ServerStatistics:
-    """A snapshot of a server's statistics: three figures of now, then the totals so far.
+    """A snapshot of a server's statistics.
+
+    ``running``, ``waiting`` and ``unanswered`` are current. The counts after them are totals.
 
     Attributes:
         srv_name: the resolved name.
@@ -85,10 +87,10 @@ class ServerStatistics:
         taken: requests taken out of the middleware.
         responded: responses sent.
         deferred: handlers that returned without having responded.
-        failed: handlers that raised an exception, or returned something else than a response.
+        failed: handlers that raised an exception, or returned something other than a response.
         rejected: requests that arrived when the backlog was full, answered or not.
-        dropped: calls that never get an answer although no handler failed: past the backlog,
-            garbage-collected unanswered, or unanswered when the server ended.
+        dropped: calls left unanswered although no handler failed: beyond the backlog,
+            garbage-collected, or unanswered when the server ended.
         undeliverable: responses whose client could not be reached, as far as the middleware shows.
     """
 

@@ -14,7 +14,7 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    # With a type by its name, a generic class of rosasync is one of Any (PEP 696).
+    # If a service type is given by its name, these are inferred as Any (PEP 696).
     from typing_extensions import TypeVar as DefaultTypeVar
 
     RequestT = DefaultTypeVar("RequestT", default=Any)
@@ -28,8 +28,8 @@ Timeout: TypeAlias = float | EllipsisType | None
 """Seconds; None for no deadline; ``...``, or left out, for the callee's default."""
 
 
-# Invariant in the request: otherwise a checker finds a common base of the service's request and of
-# the one that is passed, and accepts any message.
+# Invariant in the request: otherwise a checker infers a common base of the service's request and
+# the request that is passed, and accepts any message.
 class ServiceType(Protocol[RequestT, ResponseT_co]):  # type: ignore[misc]
     """A service class, such as ``std_srvs.srv.SetBool``; every generated one fits.
 

@@ -14,7 +14,7 @@ pytestmark = pytest.mark.asyncio(loop_factories=["asyncio", "uvloop"])
 
 
 class Work:
-    """Waits for a future, then for a turn, and writes down how far it came."""
+    """Waits for a future, then for a turn, and records its steps."""
 
     def __init__(self) -> None:
         self.loop = asyncio.get_running_loop()

@@ -86,7 +86,7 @@ async def ticked(behaviour: Behaviour) -> Status:
 
 
 class TestOutcomes:
-    """How a run ends, and where its response, error and feedback go."""
+    """The status of a run, and its response, error and feedback."""
 
     async def test_an_answer_is_success(self, fake_session: Session) -> None:
         answers: list[Any] = []
@@ -195,7 +195,7 @@ class TestWaitForService:
         assert leaf.feedback_message == "waiting for /new"
         graph.serve(ECHO, "/new", lambda _: None)
         assert await ticked(leaf) is Status.SUCCESS
-        assert leaf.feedback_message == "/new is there"
+        assert leaf.feedback_message == "/new is available"
 
     async def test_it_fails_at_the_deadline(self, fake_session: Session) -> None:
         leaf = ready(WaitForService("wait", ECHO, "/new", timeout=TICK), fake_session)
@@ -363,7 +363,7 @@ class TestSetup:
     async def test_it_does_not_wait_for_a_server(self, fake_session: Session) -> None:
         for leaf in (CallService("a", ECHO, "/absent"), WaitForService("b", ECHO, "/absent")):
             with ThreadPoolExecutor() as threads:
-                # The loop stands still, so setup cannot wait for it.
+                # The loop is blocked, so setup cannot wait for it.
                 threads.submit(ready, leaf, fake_session).result(LIMIT)
             assert isinstance(leaf.proxy, AsyncServiceProxy)
 

@@ -11,14 +11,14 @@ from tests.support.checks import assert_clean, check_call, count_takes
 from tests.support.servers import ServerProcess
 from tests.support.times import LIMIT, TICK
 
-MOST_LOOKS = 20
-"""How often a client may look for a response without polling; polling takes hundreds of looks."""
+MAX_TAKES = 20
+"""The maximum number of takes without polling. Polling takes hundreds of times."""
 
 
 @pytest.mark.parametrize("calls", [100, pytest.param(500, marks=pytest.mark.soak)])
 @pytest.mark.parametrize("budget", [2e-5, 5e-5, 1e-4, 2e-4, 1e-3])
 async def test_every_call_is_answered(echo: str, budget: float, calls: int) -> None:
-    """The budgets are about as long as a call: many responses come as the loop stops polling."""
+    """The budgets are about as long as a call, so many responses arrive as the polling stops."""
     async with Session("busy", bridge="direct", busy_poll=budget) as session:
         await session.wait_for_service("diagnostic_msgs/srv/AddDiagnostics", echo, timeout=LIMIT)
 
@@ -51,10 +51,10 @@ async def test_a_slow_service_is_not_spun_for(server: ServerProcess) -> None:
     with count_takes() as takes:
         async with Session("busy", bridge="direct", busy_poll=TICK) as session:
             await check_call(session, "/echo", "first", timeout=LIMIT)
-            takes.looks = 0
+            takes.attempts = 0
             for number in range(5):
                 await check_call(session, "/echo", str(number), timeout=LIMIT)
-            assert 5 <= takes.looks <= 5 * MOST_LOOKS
+            assert 5 <= takes.attempts <= 5 * MAX_TAKES
 
 
 async def test_after_a_slow_answer_it_sleeps_until_a_quick_one(server: ServerProcess) -> None:
@@ -65,9 +65,9 @@ async def test_after_a_slow_answer_it_sleeps_until_a_quick_one(server: ServerPro
             await check_call(session, "/echo", "quick", timeout=LIMIT)
             await server.change("/echo", 2 * TICK)
             await check_call(session, "/echo", "slow, spun for", timeout=LIMIT)
-            takes.looks = 0
+            takes.attempts = 0
             await check_call(session, "/echo", "slow, slept for", timeout=LIMIT)
-            assert 1 <= takes.looks <= MOST_LOOKS
+            assert 1 <= takes.attempts <= MAX_TAKES
             await server.change("/echo", None)
             await check_call(session, "/echo", "quick again", timeout=LIMIT)
 

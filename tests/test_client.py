@@ -1,4 +1,4 @@
-"""One client on a fake port: sequence numbers, deadlines, what an ended call leaves."""
+"""One client on a fake port: sequence numbers, deadlines, and the state after a call ends."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from rosasync.testing import FakeClient, FakeGraph, FakeNode
 from tests.support.times import TICK, until
 
 
-class Rig:
-    """A client, the fake port below it, and how often it reported capacity."""
+class ClientUnderTest:
+    """A client on a fake port, with the number of times it reported capacity."""
 
     def __init__(self, **limits: Any) -> None:
         self.node = FakeNode(FakeGraph())
@@ -36,7 +36,7 @@ class Rig:
         self.capacity += 1
 
     async def call(self, deadline: float | None = None, retry: Retry | None = None) -> Any:
-        """Call in the place of a lease that is held elsewhere."""
+        """Call as on a lease, so that no lease of the client is released."""
         call = Call(asyncio.get_running_loop().create_future(), None, retry, leased=True)
         call.start(self.client)
         if deadline is not None:
@@ -55,85 +55,81 @@ class Rig:
 
 
 async def test_responses_find_their_callers_in_any_order() -> None:
-    rig = Rig()
-    tasks = [await rig.calling() for _ in range(3)]
+    tested = ClientUnderTest()
+    tasks = [await tested.calling() for _ in range(3)]
     for number in (2, 3, 1):
-        rig.port.deliver(number, f"answer {number}")
+        tested.port.deliver(number, f"answer {number}")
     assert await asyncio.gather(*tasks) == ["answer 1", "answer 2", "answer 3"]
-    assert rig.client.abandoned == rig.counts.in_flight == 0
-    assert rig.counts.peak == 3
+    assert tested.client.abandoned == tested.counts.in_flight == 0
+    assert tested.counts.peak == 3
 
 
 async def test_a_passed_deadline_abandons_and_the_late_response_frees() -> None:
-    rig = Rig(in_flight=1)
+    tested = ClientUnderTest(in_flight=1)
     deadline = asyncio.get_running_loop().time() + TICK
     with pytest.raises(Expired):
-        await rig.call(deadline)
-    assert (rig.client.abandoned, rig.client.capacity) == (1, 0)
-    assert not rig.client.is_idle
-    rig.port.deliver(1, "late")
-    assert (rig.client.abandoned, rig.client.capacity, rig.counts.late, rig.capacity) == (
-        0,
-        1,
-        1,
-        1,
-    )
+        await tested.call(deadline)
+    assert (tested.client.abandoned, tested.client.capacity) == (1, 0)
+    assert not tested.client.is_idle
+    tested.port.deliver(1, "late")
+    assert (tested.client.abandoned, tested.client.capacity) == (0, 1)
+    assert (tested.counts.late, tested.capacity) == (1, 1)
 
 
 async def test_a_response_twice_is_late_once() -> None:
-    rig = Rig()
-    task = await rig.calling()
-    rig.port.deliver(1, "first")
-    rig.port.deliver(1, "second")
+    tested = ClientUnderTest()
+    task = await tested.calling()
+    tested.port.deliver(1, "first")
+    tested.port.deliver(1, "second")
     assert await task == "first"
-    assert rig.counts.late == 1
+    assert tested.counts.late == 1
 
 
 async def test_an_answered_attempt_frees_those_before_it() -> None:
-    rig = Rig()
-    task = await rig.calling(retry=Retry(3, TICK, 1.0))
-    await until(lambda: len(rig.port.sent) == 3)
-    rig.port.deliver(2, "second attempt")
+    tested = ClientUnderTest()
+    task = await tested.calling(retry=Retry(3, TICK, 1.0))
+    await until(lambda: len(tested.port.sent) == 3)
+    tested.port.deliver(2, "second attempt")
     assert await task == "second attempt"
-    assert rig.client.abandoned == 1  # The third; the first was before the second in the queue.
-    rig.port.deliver(1, "first attempt")
-    assert (rig.client.abandoned, rig.counts.late, rig.port.out) == (1, 1, {3})
+    assert tested.client.abandoned == 1  # The third; the first was before the second in the queue.
+    tested.port.deliver(1, "first attempt")
+    assert (tested.client.abandoned, tested.counts.late, tested.port.out) == (1, 1, {3})
 
 
 async def test_a_send_that_fails_again_ends_the_call() -> None:
-    rig = Rig()
-    task = await rig.calling(retry=Retry(2, TICK))
+    tested = ClientUnderTest()
+    task = await tested.calling(retry=Retry(2, TICK))
 
     def refuse(request: object) -> int:
         raise RuntimeError("the middleware is gone")
 
-    rig.client.send = refuse
+    tested.client.send = refuse
     with pytest.raises(RuntimeError, match="gone"):
         await task
-    assert rig.counts.in_flight == 0
+    assert tested.counts.in_flight == 0
 
 
 async def test_fail_ends_every_call_and_forgets_the_abandoned() -> None:
-    rig = Rig()
-    tasks = [await rig.calling() for _ in range(3)]
+    tested = ClientUnderTest()
+    tasks = [await tested.calling() for _ in range(3)]
     tasks[0].cancel()
     await asyncio.wait(tasks[:1])
-    assert rig.client.abandoned == 1
-    rig.client.fail(ZeroDivisionError)
+    assert tested.client.abandoned == 1
+    tested.client.fail(ZeroDivisionError)
     results = await asyncio.gather(*tasks, return_exceptions=True)
     assert [type(r) for r in results[1:]] == [ZeroDivisionError] * 2
-    assert (rig.client.abandoned, rig.port.out) == (0, set())
+    assert (tested.client.abandoned, tested.port.out) == (0, set())
 
 
 async def test_close_is_idempotent_and_leaves_no_timer() -> None:
-    rig = Rig(grace=1000.0)
-    task = await rig.calling()
+    tested = ClientUnderTest(grace=1000.0)
+    task = await tested.calling()
     task.cancel()
     await asyncio.wait([task])
-    timer = rig.client._grace_timer
+    timer = tested.client._grace_timer
     assert timer is not None
-    rig.client.close()
-    rig.client.close()
+    tested.client.close()
+    tested.client.close()
     assert timer.cancelled()
-    assert rig.port.closed
-    assert repr(rig.client) == "<Client closed, 0 leases, 0 abandoned>"
+    assert tested.port.closed
+    assert repr(tested.client) == "<Client closed, 0 leases, 0 abandoned>"

@@ -51,8 +51,7 @@ class Cost:
     """What one call costs.
 
     Attributes:
-        functions: how often functions of the library are entered; a coroutine that is resumed
-            counts again.
+        functions: how often functions of the library are entered. Resuming a coroutine counts too.
         c_functions: how many C functions those call.
         peak: the most bytes in use during the call, above those before it, by tracemalloc.
         left: bytes that stay in use after the call. The lowest of several batches counts, because
@@ -160,7 +159,7 @@ async def test_one_of_ten_calls_at_once(session: Session, echo: str) -> None:
     async def ten() -> None:
         await asyncio.gather(*(client.call(request) for _ in range(AT_ONCE)))
 
-    # Sometimes the loop looks for a response that it has already taken with another one.
+    # Sometimes the loop tries to take a response that it has already taken with another one.
     bound = BOUNDS[session.bridge]
     assert await cost_of(ten, AT_ONCE) <= replace(bound, functions=bound.functions + 1)
 

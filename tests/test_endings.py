@@ -1,4 +1,4 @@
-"""Cancellation and endings: each row of the contract, at each await on the way."""
+"""Cancellation and endings: each row of the contract, at each await of a call."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 @pytest.fixture
 async def narrow(bridge: Bridge) -> AsyncIterator[Session]:
-    """A session with one place for each service, kept for long when abandoned."""
+    """A session with one place for each service, and a long grace period."""
     limits = Limits(clients=1, in_flight=1, grace=LIMIT)
     async with Session("narrow", bridge=bridge, limits=limits, timeout=LIMIT) as session:
         yield session
@@ -48,12 +48,12 @@ def call(session: Session, name: str, text: str, **options: Any) -> asyncio.Task
 
 
 async def waiting(session: Session, callers: int) -> None:
-    """Wait until so many callers stand in line."""
+    """Wait until this number of callers is queued."""
     await until(lambda: session.pool.statistics().waiting == callers)
 
 
 class TestWhileWaitingForAClient:
-    """Nothing was sent; a client granted in the same turn goes to the next in line."""
+    """Nothing was sent; a client granted in the same turn goes to the next caller."""
 
     async def test_cancelled(self, narrow: Session, server: ServerProcess) -> None:
         await server.serve("/echo", delay="hold")
@@ -111,12 +111,12 @@ class TestWhileWaitingForAClient:
             await server.release("/echo")
             await first
             await asyncio.sleep(0)
-            if victim.suspensions > 1 or not victim.struck:
+            if victim.suspensions > 1 or not victim.cancelled:
                 sent.append("victim")
                 await server.received("/echo", len(sent))
                 await server.release("/echo")
             await asyncio.wait([victim.task])
-            assert victim.task.cancelled() == victim.struck, victim
+            assert victim.task.cancelled() == victim.cancelled, victim
             sent.append(repr(victim))
             assert await server.received("/echo", len(sent)) == sent, victim
             first = last
@@ -126,7 +126,7 @@ class TestWhileWaitingForAClient:
 
 
 async def check_call_held(session: Session, server: ServerProcess, text: str) -> None:
-    """Make a call of a service that holds its answers, and have it answered."""
+    """Call a service that holds its responses, and release the response."""
     before = len(await server.received("/echo"))
     task = call(session, "/echo", text)
     await server.received("/echo", before + 1)
@@ -135,7 +135,7 @@ async def check_call_held(session: Session, server: ServerProcess, text: str) ->
 
 
 class TestWhileWaitingForAServer:
-    """Nothing was sent; others who wait for it are not disturbed."""
+    """Nothing was sent; other waiting callers are not affected."""
 
     async def test_cancelled(self, session: Session, server: ServerProcess) -> None:
         victim, other = call(session, "/echo", "victim"), call(session, "/echo", "other")
@@ -180,10 +180,10 @@ class TestWhileWaitingForAServer:
             await asyncio.sleep(0)
             await server.serve(name)
             await asyncio.wait([victim.task])
-            assert victim.task.cancelled() == victim.struck, victim
+            assert victim.task.cancelled() == victim.cancelled, victim
             assert answer_to(await other) == "other"
             sent = ["other"]
-            if victim.moment == "as it wakes" or not victim.struck:
+            if victim.moment == "as it wakes" or not victim.cancelled:
                 sent.insert(0, "victim")
             assert await server.received(name) == sent, victim
         await assert_clean(session)
@@ -233,7 +233,7 @@ class TestAfterSending:
             assert answer_to(await following) == "following"
             await server.answered("/echo", 2)
             await assert_clean(session)
-            await check_call_held(session, server, "the late one harmed nobody")
+            await check_call_held(session, server, "after the late response")
 
     async def test_a_timeout_says_what_was_called(
         self, session: Session, server: ServerProcess
@@ -256,8 +256,8 @@ class TestAfterSending:
 
         async for victim in every_victim(make):
             await asyncio.wait([victim.task])
-            assert victim.task.cancelled() == victim.struck, victim
-            cancelled += victim.struck
+            assert victim.task.cancelled() == victim.cancelled, victim
+            cancelled += victim.cancelled
             await check_call(session, echo, repr(victim))
         await assert_clean(session)
         statistics = session.pool.statistics()
@@ -273,7 +273,7 @@ class TestAfterSending:
         await leased()
         async for victim in every_victim(leased):
             await asyncio.wait([victim.task])
-            assert victim.task.cancelled() == victim.struck, victim
+            assert victim.task.cancelled() == victim.cancelled, victim
             await check_call(narrow, echo, repr(victim))
         await assert_clean(narrow)
 
@@ -286,8 +286,8 @@ class TestAfterSending:
         for number in range(5):
             task = call(session, "/echo", "victim")
             await server.received("/echo", number + 1)
-            # The cancellation is next in the loop's line when the response reaches the process, so
-            # the task's wake-up comes after both.
+            # When the response arrives, the cancellation is already scheduled. So the task resumes
+            # after both.
             loop.call_soon(task.cancel)
             server.ask_now("release", name="/echo", count=None, newest=False)
             time.sleep(TICK)  # noqa: ASYNC251
@@ -301,7 +301,7 @@ class TestAfterSending:
 
 
 async def give_up(session: Session, server: ServerProcess, way: str) -> None:
-    """Have a call sent, and cancel it or let it time out."""
+    """Make a call, and cancel it or let it time out after it was sent."""
     task = call(session, "/echo", "given up", timeout=LIMIT if way == "cancelled" else 6 * TICK)
     await server.received("/echo", 1)
     if way == "cancelled":
@@ -314,7 +314,7 @@ Ways = dict[str, asyncio.Task[Any]]
 
 
 async def wait_in_every_way(session: Session, server: ServerProcess) -> Ways:
-    """Start a task that waits in each way there is; the session has one place for each service."""
+    """Start a task for each way to wait, in a session with one place for each service."""
     await server.serve("/echo", delay="hold")
     ways: Ways = {"for a response": call(session, "/echo", "out", timeout=None)}
     await server.received("/echo", 1)
@@ -338,7 +338,7 @@ async def wait_in_every_way(session: Session, server: ServerProcess) -> Ways:
 
 
 async def assert_all_raise(ways: Ways, error: type[RosasyncError], limit: float) -> None:
-    """Hold that every task ends with this error, none with a cancellation."""
+    """Assert that every task ends with this error, and none with a cancellation."""
     await asyncio.wait(ways.values(), timeout=limit)
     endings = {
         name: "cancelled" if task.cancelled() else task.exception() if task.done() else "pending"

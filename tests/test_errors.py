@@ -1,4 +1,4 @@
-"""Errors keep what they say, also as copies and in other processes."""
+"""Errors keep their message and attributes in copies and other processes."""
 
 from __future__ import annotations
 

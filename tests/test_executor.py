@@ -1,4 +1,4 @@
-"""The executor thread, borrowed nodes and contexts, and what callbacks can do to a session."""
+"""The executor thread, borrowed nodes and contexts, and callbacks of the node."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ class TestOwnThread:
 
 
 class TestBorrowed:
-    """What is passed in is neither shut down nor destroyed."""
+    """Borrowed nodes and contexts are neither shut down nor destroyed."""
 
     async def test_a_context(self, bridge: Bridge, context: Any, echo: str) -> None:
         for number in range(2):
@@ -229,7 +229,7 @@ class TestBorrowed:
     async def test_a_node_that_the_user_spins_later(
         self, bridge: Bridge, node: Any, echo: str
     ) -> None:
-        """A session that ends leaves it in the executor that has it by then."""
+        """A session that ends leaves the node in the executor that it is in by then."""
         executor = SingleThreadedExecutor(context=node.context)
         async with Session(node, bridge=bridge) as session:
             await check_call(session, echo, "before")

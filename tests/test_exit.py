@@ -1,4 +1,4 @@
-"""Programs that end in ways a session does not expect: no abort, no hang, no silence."""
+"""Programs that end without closing their session: no abort, no hang, and a warning."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ bridge = sys.argv[1]
 
 
 async def run(bridge: Bridge, program: str, send: int | None = None) -> tuple[int, str]:
-    """Run a program to its end; its exit code and what it wrote to stderr."""
+    """Run a program to its end; return its exit code and its stderr."""
     process = await asyncio.create_subprocess_exec(
         *(sys.executable, "-W", "default::ResourceWarning", "-c", BEGINNING + program, bridge),
         stdout=subprocess.PIPE,
@@ -57,7 +57,7 @@ async def run(bridge: Bridge, program: str, send: int | None = None) -> tuple[in
 
 @pytest.mark.usefixtures("echo")
 class TestLeftOpen:
-    """A session that nobody closes says so, and ends with the interpreter."""
+    """An unclosed session warns, and ends with the interpreter."""
 
     async def test_held_by_the_program(self, bridge: Bridge) -> None:
         code, errors = await run(bridge, "session = asyncio.run(opened(bridge))")
@@ -105,7 +105,7 @@ asyncio.run(main())
 
 @pytest.mark.usefixtures("echo")
 class TestAbruptEnds:
-    """The program's own end comes before the session's."""
+    """The program ends before the session does."""
 
     async def test_an_exception_in_the_block(self, bridge: Bridge) -> None:
         program = """

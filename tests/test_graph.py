@@ -1,4 +1,4 @@
-"""What the ROS graph tells: servers that appear, vanish, or are not what was asked for."""
+"""The ROS graph: servers that appear, vanish, or do not fit."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 async def seen(session: Session, name: str) -> None:
-    """Wait until the session's node knows that the stock server's node serves this name."""
+    """Wait until the session's node sees this service of the stock server's node."""
 
     def listed() -> bool:
         if "stock_server" not in session.node.get_node_names():
@@ -32,7 +32,7 @@ async def seen(session: Session, name: str) -> None:
 
 
 class TestUnavailable:
-    """The message says what was seen instead."""
+    """The message says what the graph shows instead."""
 
     async def test_nothing(self, session: Session) -> None:
         with pytest.raises(ServiceUnavailable, match="/echo") as caught:
@@ -81,7 +81,7 @@ class TestUnavailable:
 
 
 class TestAppearing:
-    """A server that starts after the call does."""
+    """Servers that start after the call."""
 
     async def test_the_waiting_call_is_sent_when_it_appears(
         self, session: Session, server: ServerProcess
@@ -113,7 +113,7 @@ class TestAppearing:
     async def test_the_first_call_of_many_new_sessions_is_answered(
         self, bridge: Bridge, echo: str
     ) -> None:
-        """The first response after "ready" is what others lose."""
+        """The first response after the match is the one that gets lost in rclpy."""
         for number in range(5):
             async with Session("brief", bridge=bridge) as session:
                 await check_call(session, echo, str(number))

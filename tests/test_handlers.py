@@ -1,4 +1,4 @@
-"""Handlers: their kinds, and what becomes of a handler or a hook that raises."""
+"""Handlers: their kinds, and handlers and hooks that raise."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The pool with real clients: shared and exclusive, fairness, eviction, and nothing that grows."""
+"""The pool with real clients: shared and exclusive use, fairness, eviction, constant resources."""
 
 from __future__ import annotations
 

@@ -33,7 +33,6 @@ from std_srvs.srv import Empty, SetBool, Trigger
 
 from rosasync.ros.messages import (
     request_message,
-    response_message,
     service_type,
     to_dict,
     to_message,
@@ -137,24 +136,21 @@ def test_type_name(named: type[Any], name: str) -> None:
     assert type_name(named) == name
 
 
-# Requests and responses
+# Requests
 
 
 def test_message_of_the_right_type_passes_as_it_is() -> None:
-    request, response = SetBool.Request(data=True), SetBool.Response(success=True)
+    request = SetBool.Request(data=True)
     assert request_message(SetBool, request) is request
-    assert response_message(SetBool, response) is response
 
 
 def test_none_is_an_empty_message() -> None:
     assert request_message(SetBool, None) == SetBool.Request()
-    assert response_message(SetBool, None) == SetBool.Response()
 
 
 @pytest.mark.parametrize("mapping", [dict, MappingProxyType])
 def test_mapping_becomes_a_message(mapping: Any) -> None:
     assert request_message(SetBool, mapping({"data": True})) == SetBool.Request(data=True)
-    assert response_message(SetBool, mapping({"message": "a"})) == SetBool.Response(message="a")
 
 
 @pytest.mark.parametrize(

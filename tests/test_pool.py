@@ -1,4 +1,4 @@
-"""The pool on fake ports: who gets a client, in which order, and what is left behind."""
+"""The pool on fake ports: the order in which callers get clients, and what remains afterwards."""
 
 from __future__ import annotations
 
@@ -123,8 +123,8 @@ async def test_a_place_granted_to_one_who_is_cancelled_goes_to_the_next(
     server = fake_graph.serve(Echo, "/echo", echo)
     async with opened(fake_graph, Limits(in_flight=1)) as session:
         async with session.pool.lease(Echo, "/echo"):
-            first, second = await in_line(session, 1, 2)
-        # The lease has just been granted to the first, whose task does not know it yet.
+            first, second = await queued(session, 1, 2)
+        # The place has been granted to the first call, whose task has not resumed yet.
         first.cancel()
         assert await second == 2
         with pytest.raises(asyncio.CancelledError):
@@ -139,7 +139,7 @@ async def test_who_comes_while_another_is_granted_a_place_is_sent_after_him(
     server = fake_graph.serve(Echo, "/echo", echo)
     async with opened(fake_graph, Limits(in_flight=2)) as session:
         async with session.pool.lease(Echo, "/echo"), session.pool.lease(Echo, "/echo"):
-            (first,) = await in_line(session, 1)
+            (first,) = await queued(session, 1)
         assert await ask(session, 2) == 2
         assert await first == 1
     assert [request.value for request in server.received] == [1, 2]
@@ -153,8 +153,8 @@ async def test_a_place_granted_to_one_whose_time_is_up_goes_to_the_next(
         loop = asyncio.get_running_loop()
         async with session.pool.lease(Echo, "/echo"):
             late = asyncio.create_task(ask(session, 1, timeout=TICK))
-            (second,) = await in_line(session, 2, waiting=2)
-            # Its deadline passes in the very turn in which it is granted the lease.
+            (second,) = await queued(session, 2, waiting=2)
+            # The deadline passes in the turn in which the lease is granted.
             loop.call_later(TICK / 2, time.sleep, TICK)
             await asyncio.sleep(TICK / 2)
         assert await second == 2
@@ -167,7 +167,7 @@ async def test_a_place_granted_as_everything_ends(fake_graph: FakeGraph) -> None
     server = fake_graph.serve(Echo, "/echo", echo)
     async with opened(fake_graph, Limits(in_flight=1)) as session:
         async with session.pool.lease(Echo, "/echo"):
-            (first,) = await in_line(session, 1)
+            (first,) = await queued(session, 1)
         fake_graph.nodes[0].shutdown()
         with pytest.raises(ContextShutdown):
             await first
@@ -175,11 +175,11 @@ async def test_a_place_granted_as_everything_ends(fake_graph: FakeGraph) -> None
 
 
 async def test_a_place_granted_as_the_server_goes(fake_graph: FakeGraph) -> None:
-    """Who was granted it waits for the next server, before those behind."""
+    """The granted callers wait for the next server, ahead of the rest of the queue."""
     old = fake_graph.serve(Echo, "/echo", echo)
     async with opened(fake_graph, Limits(in_flight=2)) as session:
         async with session.pool.lease(Echo, "/echo"), session.pool.lease(Echo, "/echo"):
-            tasks = await in_line(session, 1, 2, 3)
+            tasks = await queued(session, 1, 2, 3)
         old.close()
         await asyncio.sleep(TICK)
         assert session.pool.statistics().waiting == 3
@@ -189,10 +189,10 @@ async def test_a_place_granted_as_the_server_goes(fake_graph: FakeGraph) -> None
     assert old.received == []
 
 
-async def in_line(
+async def queued(
     session: Session, *values: int, waiting: int | None = None
 ) -> list[asyncio.Task[object]]:
-    """Start calls that have to wait for a place, and wait until so many do."""
+    """Start calls that have to wait for a place, and wait until ``waiting`` callers (all) do."""
     tasks = [asyncio.create_task(ask(session, value)) for value in values]
     await until(lambda: session.pool.statistics().waiting == (waiting or len(values)))
     return tasks
@@ -455,16 +455,16 @@ class TestLease:
 
 
 class TestRetry:
-    """`Retry`, where requests or responses get lost."""
+    """`Retry`, if requests or responses get lost."""
 
     async def test_what_was_lost_is_sent_again(self, fake_graph: FakeGraph) -> None:
         server = fake_graph.serve(Echo, "/echo", echo)
         async with opened(fake_graph) as session:
             await ask(session, 0)
             with fake_graph.drop_requests():
-                task = asyncio.create_task(ask(session, 1, retry=Retry(after=TICK)))
-                await until(lambda: session.pool.statistics().in_flight == 1)
-            assert await task == 1
+                # Sends at once, so that the block ends before the second attempt.
+                task = session.start(Echo, "/echo", Echo.Request(1), retry=Retry(after=TICK))
+            assert (await task).value == 1
             total = session.pool.statistics()
         assert (total.retried, total.abandoned, len(server.received)) == (1, 0, 2)
 
@@ -565,7 +565,7 @@ async def test_several_servers_of_one_name_are_warned_of_once(
 
 
 async def test_a_storm_leaves_nothing(fake_graph: FakeGraph) -> None:
-    """Calls cancelled and timed out at random, among others: none of the others is lost."""
+    """Calls that are cancelled or time out at random do not cause others to be lost."""
     dice = random.Random(1)
     server = fake_graph.serve(Echo, "/echo", echo)
 

@@ -1,4 +1,4 @@
-"""Calls from other threads: responses, cancellation, deadlines, and each way they can end."""
+"""Calls from other threads: responses, cancellation, deadlines and errors."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ NAME = "/echo"
 
 @pytest.fixture
 async def held(server: ServerProcess) -> ServerProcess:
-    """A server that answers when the test says so."""
+    """A server that answers when the test releases the responses."""
     await server.serve(NAME, delay="hold")
     return server
 
@@ -168,7 +168,7 @@ class TestSubmit:
 
         with pytest.MonkeyPatch.context() as patch, ThreadPoolExecutor() as threads:
             patch.setattr(loop, "call_soon_threadsafe", counted)
-            # The loop stands still meanwhile.
+            # The loop is blocked during this.
             thread, futures = threads.submit(batch).result(LIMIT)
             # None if the executor's thread has just woken the loop.
             assert wake_ups.count(thread) <= 1
@@ -201,7 +201,7 @@ class TestSubmit:
             session.from_thread.submit(ECHO, NAME, request_of("cancelled")).cancel()
 
         with ThreadPoolExecutor() as threads:
-            # The loop stands still meanwhile.
+            # The loop is blocked during this.
             threads.submit(submit_and_cancel).result(LIMIT)
         await session.call(ECHO, NAME, request_of("called"))
         assert await server.received(NAME) == ["called"]
@@ -317,7 +317,7 @@ class TestEndings:
     async def test_a_call_still_queued_when_the_session_closes(self, bridge: Bridge) -> None:
         async with Session(bridge=bridge) as session:
             with ThreadPoolExecutor() as threads:
-                # The loop stands still meanwhile, and does not turn before the session closes.
+                # The loop is blocked during this, and has no turn before the session closes.
                 future = threads.submit(
                     session.from_thread.submit, ECHO, NAME, timeout=None
                 ).result(LIMIT)
@@ -367,7 +367,7 @@ class TestEndings:
                 await in_thread(session.from_thread.call, ECHO, "/another")
 
     def test_the_loop_is_closed_and_the_session_is_not(self) -> None:
-        """The session cannot tell the thread; the thread notices that the loop is closed."""
+        """The session cannot notify the thread, so the thread polls whether the loop is closed."""
         loop = asyncio.new_event_loop()
         graph = FakeGraph()
         session = loop.run_until_complete(graph.session().__aenter__())
@@ -389,7 +389,7 @@ class TestEndings:
         session.core.closed = True
 
     def test_the_loops_tasks_are_cancelled_and_the_session_is_not_closed(self) -> None:
-        """As ``asyncio.run`` does at its end with the tasks that are left."""
+        """``asyncio.run`` cancels the remaining tasks at its end."""
         graph = FakeGraph()
         graph.serve(ECHO, NAME, lambda _: None)
         with asyncio.Runner() as runner, ThreadPoolExecutor() as threads, graph.drop_requests():

@@ -1,4 +1,4 @@
-"""What every port keeps to, fake and real: one suite for all of them."""
+"""The contract of the ports: one suite for the real ones and the fake."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Kind = Literal["fake", "direct", "executor"]
 
 
 class World:
-    """A node under test, and a way to have servers come and go."""
+    """A node under test, with functions to add and remove servers."""
 
     node: NodePort
 

@@ -48,7 +48,7 @@ ERROR = ProxyState.ERROR
 NAME = "/echo"
 
 SOON = 3 * TICK
-"""The timeout of what is to time out, in seconds."""
+"""Seconds, for operations that are to time out."""
 
 
 async def settled(proxy: AsyncServiceProxy) -> ProxyState:
@@ -58,7 +58,7 @@ async def settled(proxy: AsyncServiceProxy) -> ProxyState:
 
 
 class Stage:
-    """A proxy, its graph, and a server that answers when the test says so."""
+    """A proxy, its graph, and a server that answers when the test releases its responses."""
 
     def __init__(self, graph: FakeGraph, session: Session) -> None:
         self.graph = graph
@@ -68,7 +68,7 @@ class Stage:
         self.server: FakeServer | None = None
 
     def serve(self) -> None:
-        """Have a server appear that holds back its responses."""
+        """Add a server that holds back its responses."""
         if self.server is None:
             self._held.enter_context(self.graph.hold_requests())
             self.server = self.graph.serve(ECHO, NAME, lambda _: "the answer")
@@ -154,7 +154,7 @@ TOLD = {
 
 
 async def turns() -> None:
-    """Let the loop turn often enough for everything that is due."""
+    """Run the loop for enough turns to finish everything that is due."""
     for _ in range(20):
         await asyncio.sleep(0)
 
@@ -211,7 +211,7 @@ def at_once(method: Callable[[AsyncServiceProxy], object], proxy: AsyncServicePr
 def in_thread(
     method: Callable[[AsyncServiceProxy], object], proxy: AsyncServiceProxy
 ) -> ProxyState:
-    """Call a method in a thread, while the loop stands still."""
+    """Call a method in a thread, while the loop is blocked."""
     with ThreadPoolExecutor() as threads:
         return threads.submit(at_once, method, proxy).result()
 
@@ -227,7 +227,7 @@ async def test_each_method_in_each_state(
         await stage.reach(state)
         after = (at_once if where == "loop" else in_thread)(METHODS[number], stage.proxy)
         assert after is ASKED[state][number]
-        # What is still pending goes on, and nothing that was asked for before shows up.
+        # A pending operation continues, and no result of an earlier one appears.
         await answered(stage)
         stage.serve()
         await answered(stage)
@@ -539,7 +539,7 @@ class TestForerunner:
         proxy = AsyncServiceProxy(session, ECHO, "/absent")
         proxy.call_service(timeout=TICK)
         with ThreadPoolExecutor() as threads:
-            # The loop stands still meanwhile, and then finds both the deadline and the abort.
+            # The loop is blocked during this, and then handles both the deadline and the abort.
             threads.submit(time.sleep, 2 * TICK).result()
         proxy.stop_call()
         await asyncio.sleep(TICK)

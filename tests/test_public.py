@@ -6,6 +6,7 @@ import ast
 import importlib
 import inspect
 import pkgutil
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -51,6 +52,14 @@ def module(request: pytest.FixtureRequest) -> ModuleType:
 def test_the_package_has_the_names_of_the_contract() -> None:
     assert set(rosasync.__all__) >= CONTRACT
     assert sorted(rosasync.__all__) == list(rosasync.__all__)
+
+
+def test_every_public_name_is_in_the_reference() -> None:
+    pages = (page.read_text() for page in (ROOT / "docs" / "reference").glob("*.md"))
+    entries = set(re.findall(r"^::: rosasync\.(\w+)$", "\n".join(pages), re.MULTILINE))
+    # The page of the errors documents their whole module.
+    assert "errors" in entries
+    assert set(rosasync.__all__) - set(rosasync.errors.__all__) <= entries
 
 
 def test_all_names_exist_once(module: ModuleType) -> None:

@@ -1,4 +1,4 @@
-"""What is destroyed, or shut down, under a session: one error for each, and no other."""
+"""Parts that are destroyed or shut down under a session: each has exactly one error."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ async def test_a_node_that_is_down(bridge: Bridge, end: Ending) -> None:
 
 
 def refuses(function: Callable[..., object], *args: Any) -> bool:
-    """Whether it raises `ContextShutdown` by now: a shutdown is heard of in the next turn."""
+    """Return whether it raises `ContextShutdown`, which it may only do in the next turn."""
     try:
         function(*args)
     except ContextShutdown:
@@ -255,7 +255,7 @@ def no_descriptor(*_: Any) -> int:
 
 
 class TestOutOfDescriptors:
-    """EMFILE: what was created is destroyed, and what there is serves on."""
+    """EMFILE: whatever was created is destroyed, and what existed before still works."""
 
     async def test_the_first_client_and_service(self, monkeypatch: pytest.MonkeyPatch) -> None:
         async with open_node("direct") as opened:
@@ -318,7 +318,7 @@ class TestOutOfDescriptors:
 
 
 async def test_stop_takes_no_lock(bridge: Bridge) -> None:
-    """The garbage collector calls it in any thread, maybe in one that holds these."""
+    """The garbage collector may call it in a thread that holds these locks."""
     async with open_node(bridge) as opened:
         executor = opened.ros.node.executor
         locks = (executor._tasks_lock, executor._nodes_lock, executor._shutdown_lock)

@@ -1,4 +1,4 @@
-"""The graph as a node sees it: servers that fit, what is there instead, and who is informed."""
+"""The graph of a node: fitting servers, explanations if there is none, and events."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def nothing(request: Any, response: Any) -> Any:
 
 
 class TestServers:
-    """Which servers count."""
+    """Which servers fit."""
 
     async def test_they_are_told_apart_by_their_response_writers(self, opened: Opened) -> None:
         service = opened.service()
@@ -105,7 +105,7 @@ class TestServers:
 
 
 class TestMissing:
-    """What is said of a service that is not there."""
+    """The explanation of a missing service."""
 
     @pytest.mark.parametrize("events", [True, False])
     async def test_many_callers_share_one_snapshot(
@@ -170,10 +170,10 @@ class TestMissing:
 
 
 class TestEvents:
-    """Every node of a context hears of every change, though one wait set takes the event."""
+    """Every node of a context reports every change, although one wait set takes the event."""
 
     async def test_nodes_come_and_go_in_other_threads(self) -> None:
-        """The waitable that tells the others tells all of them, in an order of its own."""
+        """The waitable that is woken reports to all others, in any order."""
         stop = threading.Event()
         errors: list[Exception] = []
 
@@ -237,7 +237,7 @@ class TestExecutors:
     """Which bridge an executor allows."""
 
     def test_events_executor_is_recognised(self) -> None:
-        """Its module is not rclpy.experimental; a user may have derived another from it."""
+        """It is recognised outside rclpy.experimental, and as a base class."""
         from rclpy.impl.implementation_singleton import rclpy_implementation
 
         events_executor = rclpy_implementation.EventsExecutor

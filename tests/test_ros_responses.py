@@ -1,4 +1,4 @@
-"""Responses on the real middleware: to clients that get them, and to those that never can."""
+"""Responses on the real middleware: to clients that can receive them, and to those that cannot."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ def readers(opened: Opened) -> set[bytes]:
 
 
 async def matched(client: Any, opened: Opened, count: int) -> None:
-    """Wait until the server's request reader and the graph know so many clients."""
+    """Wait until the graph shows ``count`` clients, and the server is matched with this one."""
     await until(lambda: len(readers(opened)) == count)
     await until(client.service_is_ready)
 
 
 async def test_a_header_tells_its_client(opened: Opened) -> None:
-    """By the GUID that the graph shows for the client's response reader."""
+    """The header has the GUID that the graph shows for the client's response reader."""
     opened.serve()
     with borrowed_node() as node:
         guids: list[bytes | None] = []
@@ -117,7 +117,7 @@ rclpy.shutdown()
 
 
 async def test_a_client_that_never_matches_does_not_stop_the_others(opened: Opened) -> None:
-    """It sends ten requests a second, and the middleware would block 0.1 s for each response."""
+    """The client sends ten requests a second. Each response could block the process for 0.1 s."""
     port = opened.serve()
     sends: Counter[str] = Counter()
     responder = port._responder  # type: ignore[attr-defined]

@@ -46,7 +46,7 @@ async def in_a_task_of_its_own(closing: Awaitable[object]) -> None:
 
 
 async def after_a_pause(closing: Awaitable[object]) -> None:
-    """An eager task is only then known to the server."""
+    """Suspend first: the server does not know an eager task before that."""
     await asyncio.sleep(0)
     await closing
 
@@ -64,7 +64,7 @@ async def tasks(request: pytest.FixtureRequest) -> str:
 
 @pytest.mark.usefixtures("tasks")
 class TestHandlersThatClose:
-    """None of them is waited for: a wait without a limit would never end."""
+    """The server does not wait for them: without a timeout, the wait would never end."""
 
     @pytest.mark.parametrize("way", WAYS)
     async def test_their_server(
@@ -187,7 +187,7 @@ class TestHandlersThatClose:
         assert server.statistics().running == 0
 
     async def test_a_long_backlog_of_such(self, fake_graph: FakeGraph) -> None:
-        """An eager task would start the next one inside it, deeper than the stack allows."""
+        """Eager tasks that start one another would exceed the recursion limit."""
         count = sys.getrecursionlimit()
         gate = asyncio.Event()
 
@@ -206,7 +206,7 @@ class TestHandlersThatClose:
 
 
 class TestDestroyedServices:
-    """Something else than rosasync destroys the rclpy service."""
+    """Something other than rosasync destroys the rclpy service."""
 
     async def test_the_server_ends(self, session: Session) -> None:
         holder = Holder()
@@ -286,10 +286,10 @@ class TestDestroyedServices:
 
 
 class TestSiblings:
-    """A failure of one part does not reach the others."""
+    """A failure of one part does not affect the others."""
 
     async def test_a_request_in_the_turn_of_the_close(self, fake_graph: FakeGraph) -> None:
-        """Its handler has not begun; it is cancelled all the same, and counted."""
+        """The handler has not begun; it is cancelled and counted nevertheless."""
         begun: list[str] = []
 
         async def handler(call: AnyCall) -> Any:
@@ -355,5 +355,5 @@ def destroy(server: AnyServer) -> None:
 
 
 def warnings_of(caplog: pytest.LogCaptureFixture) -> list[str]:
-    """What the library has warned of."""
+    """Return the warnings that the library has logged."""
     return [r.getMessage() for r in caplog.records if r.levelno >= logging.WARNING]

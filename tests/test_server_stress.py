@@ -1,4 +1,4 @@
-"""Servers under load: bursts, threads that answer, closing and opening again under calls."""
+"""Servers under load: bursts, responses from threads, and repeated closing under calls."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ async def burst(
 
 
 async def join(process: ClientProcess, name: str, seen: set[str], **options: Any) -> None:
-    """Have a process call on and on, and wait until a call of its own arrives."""
+    """Have a process call continuously, and wait until one of its calls arrives."""
     await process.start(name, None, depth=1000, **options)
     await until(lambda: str(process.pid) in seen)
 
@@ -86,7 +86,7 @@ async def test_a_burst_of_500_requests_is_answered(
 async def test_a_burst_of_stock_clients_is_taken_and_answered(
     session: Session, crowd: list[ClientProcess], name: str
 ) -> None:
-    """What their own queues of ten then lose of the answers is not the server's."""
+    """The clients' queues of ten may lose responses. Those do not count against the server."""
     async with serving(session, name, "async, request and response") as server:
         result = await burst(crowd, name, timeout=LIMIT / 4)
         assert result["wrong"] == 0
@@ -98,7 +98,7 @@ async def test_a_burst_of_stock_clients_is_taken_and_answered(
 
 
 class Answerers:
-    """Four threads that answer what they are given, in a shuffled order."""
+    """Four threads that answer calls, in a shuffled order."""
 
     def __init__(self) -> None:
         self.refused = 0
@@ -186,8 +186,8 @@ async def test_the_server_closes_while_four_threads_answer(
     assert answerers.refused == statistics.dropped
     tallies = await asyncio.gather(*(process.result() for process in crowd))
     assert sum(tally.wrong for tally in tallies) == 0
-    # The middleware destroys the server's writer with what it has not delivered: no more than what
-    # the clients had in flight.
+    # The middleware drops the responses that a destroyed writer has not delivered: at most as many
+    # as the clients had in flight.
     answered = sum(tally.answered for tally in tallies)
     assert statistics.responded - in_flight <= answered <= statistics.responded
 

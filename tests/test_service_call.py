@@ -1,4 +1,4 @@
-"""ServiceCall: what it tells, and responding to it, at once, later, or not at all."""
+"""ServiceCall: its attributes, and responding at once, later, or not at all."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One service in the pool, on fake ports: what one caller does never harms the others."""
+"""One service in the pool, on fake ports: no caller affects another."""
 
 from __future__ import annotations
 

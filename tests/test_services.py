@@ -1,4 +1,4 @@
-"""Sending responses to clients that are not matched: when to send, to wait, and to give up."""
+"""Sending responses to clients that are not matched: when to send, wait or give up."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ GOOD, BAD = guid(1, 4), guid(2, 4)
 
 
 class Header:
-    """The header of a request, which tells its client if ``known``."""
+    """The header of a request, which identifies its client if ``known``."""
 
     def __init__(self, client: bytes, known: bool = True) -> None:
         self.client = client
@@ -73,10 +73,10 @@ class Middleware:
         self.writers: list[bytes] = []
 
     def __enter__(self) -> None:
-        """As a handle in use."""
+        """Like a handle in use."""
 
     def __exit__(self, *_: object) -> None:
-        """As a handle that is not in use any more."""
+        """Like a handle that is no longer in use."""
 
     def ok(self) -> bool:
         return self.up
@@ -88,7 +88,7 @@ class Middleware:
             self.readers[client] = qos
 
     def leave(self, client: bytes) -> None:
-        """Show a client no more."""
+        """Remove a client from the graph."""
         self.readers.pop(client, None)
         self.writers.remove(client[:12] + bytes([client[-1] - 1] * 4))
 
@@ -101,7 +101,7 @@ class Middleware:
         if self.report == "error":
             raise SystemError from RuntimeWarning("client will not receive response")
         if self.report == "warning":
-            # As the interpreter does, whatever the filters say.
+            # The interpreter does this too, independent of the filters.
             responder.__warningregistry__["version"] = 1
 
     def get_publishers_info_by_topic(self, name: str, no_mangle: bool) -> list[Any]:
@@ -135,7 +135,7 @@ def service(middleware: Middleware) -> Responder:
 
 
 def fail(service: Responder, client: bytes, *, known: bool = True) -> str:
-    """Send a response that cannot arrive now, and return the reason."""
+    """Send a response that cannot arrive yet, and return the reason."""
     with pytest.raises(Unmatched) as caught:
         service.send(Header(client, known), "response")
     return str(caught.value)
@@ -227,7 +227,7 @@ def test_others_that_join_meanwhile_do_not_block_at_all(
 def test_a_slow_send_to_a_visible_client_has_sent(
     middleware: Middleware, service: Responder
 ) -> None:
-    """As on a busy machine: nothing was reported."""
+    """A send may be slow because the machine is busy, although nothing was reported."""
     middleware.report = "nothing"
     middleware.unmatched.add(GOOD)
     for _ in range(3):

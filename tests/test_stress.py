@@ -1,4 +1,4 @@
-"""Thousands of calls, many of them given up at random moments."""
+"""Thousands of calls, many of them cancelled or timed out at random."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ async def test_no_wanted_answer_is_lost(
         assert statistics.timed_out == timed_out + outcomes["unanswered"]
         assert statistics.created <= limits.clients
         assert min(answered, outcomes["cancelled"], statistics.timed_out) > 0, outcomes
-        # Each response that came was counted once, and none was missed but by the middleware.
+        # Each response that arrived was counted once. Only the middleware has lost any.
         assert statistics.late > 0
         assert statistics.completed + statistics.late == takes.responses
         assert take_what_is_left(session) == 0

@@ -1,4 +1,4 @@
-"""Many leaves: their answers, the threads and files they use, and that no tick ever waits."""
+"""Many leaves: their responses, their threads and files, and ticks that never wait."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ PATIENCE = 4 * LIMIT
 
 @dataclass
 class Leaf:
-    """Calls again and again, is halted now and then, and checks each response."""
+    """Calls repeatedly, is halted at random, and checks each response."""
 
     proxy: AsyncServiceProxy
     name: str
@@ -188,7 +188,7 @@ async def test_a_dead_server_does_not_make_a_tick_longer(bridge: Bridge) -> None
         # Calls time out and are made again: the queues to the dead server fill.
         await asyncio.to_thread(tick_until, lambda: len(calls) > 200)
         with ThreadPoolExecutor() as threads:
-            # The loop stands still until the ticks are over, each of which starts every call again.
+            # The loop is blocked during the ticks, each of which starts every call again.
             threads.submit(halt_and_tick).result(LIMIT)
         assert root.status is Status.RUNNING
         tree.shutdown()

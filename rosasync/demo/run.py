@@ -343,7 +343,7 @@ def _progress() -> Progress:
 async def _take_turn(
     contestants: _Contestants, name: str, at_once: int, calls: int, until: float, into: Samples
 ) -> None:
-    """Make the calls with ``at_once`` callers, or fewer calls if ``until`` comes first."""
+    """Make the calls with ``at_once`` callers; stop at ``until``, even if calls are left."""
     calls = max(calls, at_once)
     shares = [range(caller, calls, at_once) for caller in range(at_once)]
     turn = _our_turn if name == OURS else _stock_turn

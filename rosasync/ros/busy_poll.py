@@ -9,29 +9,29 @@ __all__ = ["BusyPoll", "Pollable"]
 
 
 class Pollable(Protocol):
-    """A client that can be polled instead of signalling."""
+    """A client that can be polled for responses, or signal them."""
 
     quick: bool
-    """Whether its last response came within the budget."""
+    """Whether its last response came within the budget. Written by `BusyPoll`."""
 
     @property
     def is_waiting(self) -> bool:
         """Whether a response is expected."""
 
     def take_all(self) -> None:
-        """Take the responses that have come."""
+        """Take the responses that have arrived."""
 
     def start_signalling(self) -> None:
-        """Have responses wake the loop."""
+        """Let responses wake the loop."""
 
 
 class BusyPoll:
-    """Trades CPU for latency, as Linux's SO_BUSY_POLL (socket(7)) does.
+    """Trades CPU for latency, like Linux's SO_BUSY_POLL (socket(7)) does.
 
-    After a send the loop polls for the response once in each of its turns, so that every other
-    ready task runs in between, for ``budget`` seconds at the most. It polls only for a client
-    whose last response came within the budget, and only while a request is pending. A client that
-    is polled does not signal, which saves the middleware's thread a system call.
+    After a send, the loop polls for the response once in each turn, for up to ``budget`` seconds.
+    Other ready tasks run in between. It polls only for a client whose last response came within the
+    budget, and only while a request is pending. A client that is polled does not signal, which
+    saves the middleware's thread a system call.
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop, budget: float) -> None:
@@ -51,7 +51,7 @@ class BusyPoll:
         return now
 
     def answered(self, client: Pollable, sent: float) -> None:
-        """Learn from a response to a request sent at this time of the loop."""
+        """Record whether the response to a request sent at this loop time was quick."""
         client.quick = self._loop.time() - sent <= self._budget
 
     def leave(self, client: Pollable) -> None:

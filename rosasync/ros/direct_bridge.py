@@ -25,12 +25,12 @@ __all__ = ["DESTROY_DELAY", "DirectBridge", "DirectCallbackGroup"]
 logger = logging.getLogger("rosasync")
 
 DESTROY_DELAY = 0.02
-"""Seconds from the end of signalling to the destruction. A thread of the middleware may just be
-entering the listener, which it would use after it was freed (rmw_fastrtps issue 632)."""
+"""Seconds from the end of signalling to the destruction. A thread of the middleware may be about to
+enter the listener, and would use it after it was freed (rmw_fastrtps issue 632)."""
 
 
 class DirectCallbackGroup(CallbackGroup):  # type: ignore[misc]
-    """Keeps its clients and services from every executor: the loop takes from them itself.
+    """Hides its clients and services from every executor: the loop takes from them itself.
 
     An executor ignores an entity whose group answers False here (rclpy, executors.py).
     """
@@ -69,6 +69,7 @@ class DirectBridge:
         self._services: Signals[DirectService] = Signals(loop, _take_requests)
         self._poll = BusyPoll(loop, busy_poll) if busy_poll else None
         self._loop = loop
+        # Clients to destroy, with the timers that do so after DESTROY_DELAY, or `close` sooner.
         self._retired: dict[Any, asyncio.TimerHandle] = {}
 
     def open_client(self, srv_type: Any, srv_name: str, qos: Any, deliver: Deliver) -> DirectClient:
@@ -89,7 +90,7 @@ class DirectBridge:
         self, srv_type: Any, srv_name: str, qos: Any, deliver: DeliverRequest
     ) -> DirectService:
         """Create a service that passes its requests to ``deliver`` on the loop's thread."""
-        service = make_service(self._node, srv_type, srv_name, _nothing, qos, self._group)
+        service = make_service(self._node, srv_type, srv_name, _never_called, qos, self._group)
         try:
             self._configure(service)
             return DirectService(self._node, service, self._rcl, self._services, deliver)
@@ -98,7 +99,7 @@ class DirectBridge:
             raise
 
     def refuse(self) -> None:
-        """Have every later send fail, after the context was shut down.
+        """Make every later send fail, because the context was shut down.
 
         rcl sends requests even then, and their responses do not arrive.
         """
@@ -117,7 +118,7 @@ class DirectBridge:
         self._services.close()
 
     def _retire(self, client: Any) -> None:
-        """Destroy a client that signals no more, when no thread can be in its listener."""
+        """Destroy a client that has stopped signalling, once no thread can be in its listener."""
         if self._loop.is_closed():
             self._node.destroy_client(client)
         else:
@@ -173,6 +174,7 @@ class DirectClient:
         # rcl checks that its client is valid: after the destruction these raise.
         self.send_request = self.handle.send_request
         self._take = self.handle.take_response
+        # The unanswered requests, with the loop time of the send if the client is busy-polled.
         self._pending: dict[int, float] = {}
         self._signalling = False
         self.quick = False
@@ -214,7 +216,7 @@ class DirectClient:
             self._signal.waiting.pop(self, None)
 
     def take(self, most: int) -> int:
-        """Take responses until the queue seems empty, and return how many were this client's."""
+        """Take up to ``most`` responses until the queue seems empty; return the number taken."""
         taken = 0
         while taken < most:
             try:
@@ -232,7 +234,7 @@ class DirectClient:
             try:
                 self._deliver(sequence_number, response)
             except Exception as error:
-                # The responses behind it are signalled only once.
+                # Go on: the signal for the responses that follow was already consumed.
                 _report(self._signals.loop, self._deliver, error)
         if not self._pending:
             self._signal.waiting.pop(self, None)
@@ -245,8 +247,8 @@ class DirectClient:
     def drain(self, most: int) -> None:
         """Take ``most`` times.
 
-        A response to another process's client, which every client of the name receives, looks like
-        an empty queue, and one for this client may stand behind it.
+        A response to another process's client also reaches this one. Taking it looks like an empty
+        queue, although a response to this client may follow.
         """
         for _ in range(most):
             self.take(1)
@@ -258,7 +260,7 @@ class DirectClient:
             self._rcl.signal_responses(self.handle, None)
 
     def refuse(self) -> None:
-        """Have every later send fail."""
+        """Make every later send fail."""
         self.send_request = self._refuse_request
 
     def close(self) -> None:
@@ -274,7 +276,7 @@ class DirectClient:
         self._retire(self._client)
 
     def start_signalling(self) -> None:
-        """Have responses wake the loop, including those that have come already."""
+        """Let responses wake the loop, including those that are queued already."""
         if self._rcl.signal_responses(self.handle, self._signal.fd):
             self._signalling = True
         elif not is_destroyed(self.handle):
@@ -331,7 +333,7 @@ class DirectService:
 
     @property
     def destroyed(self) -> bool:
-        """Whether something else than rosasync has destroyed the service."""
+        """Whether something other than rosasync has destroyed the service."""
         return not self._closed and is_destroyed(self._service)
 
     def take(self, most: int) -> None:
@@ -342,7 +344,7 @@ class DirectService:
             try:
                 self._deliver(request, header)
             except Exception as error:
-                # The requests behind it have been taken already.
+                # Go on: the requests that follow have been taken already.
                 _report(self._signals.loop, self._deliver, error)
 
     def stop(self) -> None:
@@ -361,11 +363,11 @@ class DirectService:
 
 
 def _take_responses(signal: Signal[DirectClient], left: int) -> None:
-    """Take as many responses as were signalled, from the client that sent last first.
+    """Take as many responses as were signalled, starting with the client that began to wait last.
 
-    Usually each of them belongs to a client that waits for it. Those left over were for other
-    processes, and may stand in the queue of any client: the clients that wait are drained, and the
-    others stop signalling.
+    Usually each of them belongs to a client that waits for it. Any others were for other processes,
+    and may be in the queue of any client. So every client is drained, and those that wait for
+    nothing stop signalling.
     """
     for client in reversed(tuple(signal.waiting)):
         left -= client.take(left)
@@ -386,5 +388,5 @@ def _report(loop: asyncio.AbstractEventLoop, callback: object, error: Exception)
     loop.call_exception_handler({"message": f"{callback!r} failed", "exception": error})
 
 
-def _nothing(request: object, response: object) -> None:
-    """Do nothing: no executor takes from a service of the group `DirectCallbackGroup`."""
+def _never_called(request: object, response: object) -> None:
+    """Never called: no executor takes from a service in a `DirectCallbackGroup`."""

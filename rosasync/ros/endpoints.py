@@ -88,8 +88,8 @@ def prefixes(endpoints: Iterable[TopicEndpointInfo]) -> list[bytes]:
 def _explicit(qos: QoSProfile) -> QoSProfile:
     """Return the QoS with the middleware's values for the defaults.
 
-    The graph shows them so. Compared with the zeros of a profile that leaves them to the
-    middleware, each looks like an incompatibility.
+    The graph shows these values, but a profile that leaves them to the middleware has zeros. The
+    comparison of the two would report an incompatibility.
     """
     unset = Duration()
     explicit = QoSProfile(depth=1, reliability=qos.reliability, durability=qos.durability)

@@ -22,11 +22,11 @@ from rosasync.ros.services import make_service, qos_of, take_request
 __all__ = ["ExecutorBridge"]
 
 BATCH = 100
-"""Requests that the executor's thread takes at once, at the most."""
+"""Maximum number of further requests that the executor's thread takes in one callback."""
 
 
 class ExecutorBridge:
-    """Has the executor take responses and requests, and passes them to the loop by a gateway."""
+    """Passes responses and requests from the executor, which takes them, to the loop."""
 
     name = "executor"
     destroy_delay = 0.0
@@ -62,7 +62,7 @@ class ExecutorBridge:
         """Create a service that passes its requests to ``deliver`` on the loop's thread."""
         # One request at a time, so that they keep their order in a MultiThreadedExecutor.
         group = GatedCallbackGroup()
-        service = make_service(self._node, srv_type, srv_name, _request, qos, group)
+        service = make_service(self._node, srv_type, srv_name, _return_request, qos, group)
         try:
             self._configure(service)
             opened = ExecutorService(
@@ -78,7 +78,7 @@ class ExecutorBridge:
         return opened
 
     def refuse(self) -> None:
-        """Have every later send fail, after the context was shut down.
+        """Make every later send fail, because the context was shut down.
 
         rcl sends requests even then, and their responses do not arrive.
         """
@@ -140,7 +140,7 @@ class ExecutorClient:
             self._client.remove_pending_request(future)
 
     def refuse(self) -> None:
-        """Have every later send fail."""
+        """Make every later send fail."""
         self._call_async = self._refuse_request
 
     def close(self) -> None:
@@ -154,7 +154,7 @@ class ExecutorClient:
         self._node.destroy_client(self._client)
 
     def _complete(self, number: int, future: Any) -> None:
-        """Take a completed future's response to the loop. Called on the executor's thread."""
+        """Pass a completed future to the loop. Called on the executor's thread."""
         if not future.cancelled():
             self._gateway.post_if_open(self._arrived, number, future)
 
@@ -206,7 +206,7 @@ class ExecutorService:
 
     @property
     def destroyed(self) -> bool:
-        """Whether something else than rosasync has destroyed the service."""
+        """Whether something other than rosasync has destroyed the service."""
         return not self._closed and is_destroyed(self._service)
 
     def stop(self) -> None:
@@ -222,9 +222,9 @@ class ExecutorService:
             self._node.destroy_service(self.handle)
 
     def _taken(self, request: Any, header: Any) -> None:
-        """Take this request and those behind it to the loop. Called on the executor's thread.
+        """Pass this request and those queued behind it to the loop. Runs on the executor's thread.
 
-        An executor that waits again before every request is too slow for its queue.
+        The queue would overflow if the executor waited again before each request.
         """
         with contextlib.suppress(SessionClosed, InvalidHandle):
             self._gateway.post(self._arrived, request, header)
@@ -241,7 +241,7 @@ class ExecutorService:
 
 
 class GatedCallbackGroup(MutuallyExclusiveCallbackGroup):  # type: ignore[misc]
-    """Keeps its service from every executor until it is opened."""
+    """Hides its service from every executor until ``open`` is set, when the service is complete."""
 
     open = False
 
@@ -250,5 +250,5 @@ class GatedCallbackGroup(MutuallyExclusiveCallbackGroup):  # type: ignore[misc]
         return self.open and bool(super().can_execute(entity))
 
 
-def _request(request: Any, response: object) -> Any:
+def _return_request(request: Any, response: object) -> Any:
     return request

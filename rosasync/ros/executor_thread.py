@@ -26,13 +26,13 @@ _starting = threading.RLock()
 
 @dataclass(eq=False, slots=True)
 class ThreadUser:
-    """A session's part in an executor thread.
+    """One session's use of an executor thread.
 
     Attributes:
         on_error: called with an exception that a callback of the node has raised.
         on_shutdown: called if the thread ends because the context was shut down.
         on_left: called when the session has left, or the thread has ended.
-        leaving: whether the session wants to leave.
+        leaving: whether the session has asked to leave.
         left: set before ``on_left`` is called.
     """
 
@@ -58,7 +58,7 @@ class ExecutorThread:
 
     def __init__(self, node: Node, user: ThreadUser) -> None:
         self._node = node
-        # Changed by single operations only, because `leave` must not take a lock.
+        # Changed by single operations only, which are atomic: `leave` must not take a lock.
         self._users: dict[ThreadUser, None] = {user: None}
         self._deciding = False
         self._ended = False
@@ -81,16 +81,13 @@ class ExecutorThread:
 
     @property
     def ident(self) -> int | None:
-        """The thread's identifier, as ``threading.get_ident`` gives it; None once it has ended.
-
-        Another thread may get the same one then.
-        """
+        """The thread's identifier; None once it has ended, because another thread may reuse it."""
         return self._thread.ident if self._thread.is_alive() else None
 
     def enter(self, user: ThreadUser) -> bool:
-        """Use the thread as well, and return whether that is possible: not if it is ending."""
-        # Added before the decision is read, as `_decide_end` decides before it publishes:
-        # either the thread sees the user, or the user sees that the thread has ended.
+        """Join the users of the thread, and return whether that succeeded: not if it is ending."""
+        # The order matters: the user is added before `_deciding` and `_ended` are read. So either
+        # `_decide_end` counts this user, or this user sees that the thread is ending.
         self._users[user] = None
         while self._deciding:
             time.sleep(0)
@@ -99,9 +96,9 @@ class ExecutorThread:
         return not self._ended
 
     def leave(self, user: ThreadUser) -> None:
-        """Ask to leave after the callback under way. From any thread; takes no lock; idempotent.
+        """Ask to leave after the current callback. From any thread; takes no lock; idempotent.
 
-        The garbage collector calls it, maybe in a thread that holds a lock of rclpy.
+        The garbage collector may call this in a thread that holds a lock of rclpy.
         """
         user.leaving = True
         with contextlib.suppress(InvalidHandle):
@@ -112,7 +109,7 @@ class ExecutorThread:
 
         Args:
             user: who has called `leave`.
-            timeout: seconds to wait at the most.
+            timeout: the maximum number of seconds to wait.
 
         Returns:
             Whether it has left.
@@ -127,7 +124,7 @@ class ExecutorThread:
         return True
 
     def close(self) -> None:
-        """Take the node out of the executor, if the thread has ended and it still is in it."""
+        """Remove the node from the executor, if the thread has ended."""
         if self._ended:
             if self._node.executor is self._executor:
                 self._node.executor = None
@@ -147,8 +144,10 @@ class ExecutorThread:
         """Spin until no user is left, or the executor or its context is shut down."""
         while not self._decide_end():
             try:
-                # What `spin_once` does: its own errors are to be told from those of callbacks.
-                handler, _, _ = self._executor.wait_for_ready_callbacks(None, None, self._is_asked)
+                # As `spin_once`, in two steps, to distinguish its errors from those of callbacks.
+                handler, _, _ = self._executor.wait_for_ready_callbacks(
+                    None, None, self._leave_requested
+                )
             except ConditionReachedException:
                 continue
             except (ExternalShutdownException, ShutdownException):
@@ -167,13 +166,13 @@ class ExecutorThread:
             if handler.exception() is not None:
                 self._report(handler.exception())
 
-    def _is_asked(self) -> bool:
-        """Return whether a user wants to leave."""
+    def _leave_requested(self) -> bool:
+        """Return whether a user has asked to leave."""
         return any(user.leaving for user in tuple(self._users))
 
     def _decide_end(self) -> bool:
-        """Let the users go that want to leave, and return whether none is left."""
-        if not self._is_asked():
+        """Acknowledge the users that have asked to leave, and return whether no other is left."""
+        if not self._leave_requested():
             return False
         leaving = [user for user in tuple(self._users) if user.leaving]
         self._deciding = True
@@ -186,13 +185,13 @@ class ExecutorThread:
         return self._ended
 
     def _report(self, error: Exception) -> None:
-        """Report an error once, to the user that has been there longest."""
+        """Report an error once, to the first of the users."""
         for user in tuple(self._users)[:1]:
             user.on_error(error)
 
 
 class _OwnExecutor(SingleThreadedExecutor):  # type: ignore[misc]
-    """An executor with a thread of its own, found by ``node.executor``."""
+    """The executor of an `ExecutorThread`, which other sessions find by ``node.executor``."""
 
     def __init__(self, thread: ExecutorThread) -> None:
         super().__init__(context=thread.node.context)

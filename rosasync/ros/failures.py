@@ -1,4 +1,4 @@
-"""What rclpy's errors mean to users of rosasync."""
+"""Translates rclpy's errors into those of rosasync."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def is_up(node: Node) -> bool:
 
 
 def is_destroyed(handle: Any) -> bool:
-    """Return whether an entity was destroyed, or will be as soon as it is not in use any more."""
+    """Return whether an entity was destroyed, or will be once it is no longer in use."""
     try:
         with handle:
             return not handle.pointer

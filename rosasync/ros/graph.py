@@ -26,8 +26,8 @@ __all__ = ["GraphQueries", "GraphWaitable"]
 SNAPSHOT_TIME = 0.25
 """Seconds for which a snapshot of the services is used if the node reports no graph events."""
 
-# Sessions of several threads add and remove theirs while others read: by single operations only,
-# which are atomic, because an iteration would fail on the first change.
+# Sessions in several threads add and remove entries while others read. So it is used by single
+# operations only, which are atomic; an iteration would fail when another thread changes it.
 _waitables: WeakValueDictionary[int, GraphWaitable] = WeakValueDictionary()
 
 
@@ -39,7 +39,7 @@ class GraphWaitable(Waitable):  # type: ignore[misc]
     """
 
     def __init__(self, node: Node, rcl: Rcl, on_change: Callable[[], None]) -> None:
-        # The callback group knows its entities by weak reference, the waitable keeps the group.
+        # The waitable keeps this group alive; the group has only a weak reference to it.
         super().__init__(ReentrantCallbackGroup())
         self.on_change = on_change
         self.context = node.context
@@ -96,7 +96,7 @@ class GraphWaitable(Waitable):  # type: ignore[misc]
 
 
 class GraphQueries:
-    """What a node's graph shows of services. Used on the loop's thread, except `changed`.
+    """Queries a node's graph for services. Used on the loop's thread, except `changed`.
 
     Args:
         node: the node to query.
@@ -169,12 +169,12 @@ class GraphQueries:
     def _services(self) -> dict[str, set[str]]:
         """Return the types of every service that has a server, as they were a moment ago.
 
-        A snapshot takes a query for each service. Many callers may need it at one moment.
+        A snapshot takes one query for each service, and many callers may need it at the same time.
         """
         now = monotonic()
         fresh = self._events or now < self._served_until
         if self._served_generation != self._generation or not fresh:
-            # Read before the queries, so that a change meanwhile discards the snapshot.
+            # Read before the queries, so that a change during them discards the snapshot.
             generation = self._generation
             self._served = self._query_services()
             self._served_generation = generation
@@ -185,8 +185,8 @@ class GraphQueries:
         """Query the types of every service that has a server.
 
         The graph lists a name with the types of its servers and of its clients, including this
-        session's. If they differ, the nodes tell which type is served; that information may lag
-        behind by some milliseconds.
+        session's. If they differ, each node is asked for the types that it serves. That answer may
+        be some milliseconds old.
         """
         services: dict[str, set[str]] = {}
         for srv_name, types in self._node.get_service_names_and_types():
@@ -205,7 +205,7 @@ class GraphQueries:
         return set(self._services_of(self._node.get_name(), self._node.get_namespace()))
 
     def _services_of(self, name: str, namespace: str) -> dict[str, list[str]]:
-        # A node may leave the graph in between.
+        # The node may have left the graph since it was listed.
         with contextlib.suppress(rclpy_implementation.NodeNameNonExistentError):
             return dict(self._node.get_service_names_and_types_by_node(name, namespace))
         return {}

@@ -27,7 +27,6 @@ from typing import Any
 
 __all__ = [
     "request_message",
-    "response_message",
     "service_type",
     "to_dict",
     "to_message",
@@ -61,7 +60,7 @@ def type_name(srv_type: type[Any]) -> str:
     """Return the name of a service, request, response or message class as ROS writes it.
 
     ``"std_srvs/srv/SetBool"``, ``"std_srvs/srv/SetBool_Request"``, ``"geometry_msgs/msg/Pose"``.
-    A class that is not from ROS has its Python name.
+    For a class that is not from ROS, it is the Python name.
     """
     package, *inner = srv_type.__module__.split(".")
     if inner and inner[0] in ("msg", "srv", "action"):
@@ -84,13 +83,13 @@ def request_message(srv_type: type[Any], request: object) -> Any:
         ValueError: no such field, or a value out of its range.
     """
     expected = srv_type.Request
-    return request if isinstance(request, expected) else _as_message(expected, request)
-
-
-def response_message(srv_type: type[Any], response: object) -> Any:
-    """Return the response to send, as `request_message` does for requests."""
-    expected = srv_type.Response
-    return response if isinstance(response, expected) else _as_message(expected, response)
+    if isinstance(request, expected):
+        return request
+    if request is None:
+        return expected()
+    if isinstance(request, Mapping):
+        return to_message(expected, request)
+    raise TypeError(f"expected {type_name(expected)}, got {_given(request)}")
 
 
 def to_message(message_type: type[Any], fields: Mapping[str, Any]) -> Any:
@@ -137,14 +136,6 @@ def to_dict(message: object) -> dict[str, Any]:
         raise TypeError(f"expected a message, got {_given(message)}")
     fields = _fields(type(message))
     return {name: field.to_plain(getattr(message, name)) for name, field in fields.items()}
-
-
-def _as_message(expected: type[Any], value: object) -> Any:
-    if value is None:
-        return expected()
-    if isinstance(value, Mapping):
-        return to_message(expected, value)
-    raise TypeError(f"expected {type_name(expected)}, got {_given(value)}")
 
 
 def _given(value: object) -> str:
@@ -473,7 +464,7 @@ def _formats_like(typecode: str) -> tuple[str, ...]:
 
 
 def _buffer(value: Any, formats: tuple[str, ...]) -> memoryview | None:
-    """Return a view if the layout is right already, so that no element has to be checked."""
+    """Return a view of the value if its layout fits, so that no element needs a check; or None."""
     try:
         view = memoryview(value)
     except (TypeError, ValueError):  # ValueError: a NumPy array of dates, a released view
@@ -538,12 +529,12 @@ def _fields(message_type: type[Any]) -> dict[str, _Field]:
 
 
 def _field(slot: Any, default: object = None) -> _Field:
-    """Return the field for a type of rosidl_parser and the default value of that field."""
+    """Return the field for a rosidl_parser type; ``default`` is its value in a new message."""
     idl: Any = importlib.import_module("rosidl_parser.definition")
     if isinstance(slot, idl.AbstractNestedType):
         return _sequence(slot, _field(slot.value_type))
     if isinstance(slot, idl.NamespacedType):
-        # From the default if there is one: the module of an action goal is not the one in its name.
+        # Not imported if there is a default, because an action goal is not in the module it names.
         return _Nested(type(default) if default is not None else _imported(slot))
     if isinstance(slot, idl.AbstractGenericString):
         bound = slot.maximum_size if slot.has_maximum_size() else None

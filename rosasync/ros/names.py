@@ -1,4 +1,4 @@
-"""Service names, types and QoS: checked, resolved, and with their defaults."""
+"""Checks and resolves service names, types and QoS."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from rosasync.statistics import ServiceKey
 __all__ = ["default_qos", "describe"]
 
 DEPTH = 1000
-"""History of the default QoS. With rclpy's ten, requests and responses get lost."""
+"""History of the default QoS. With rclpy's default of ten, requests and responses get lost."""
 
 
 def describe(node: Node, srv_type: Any, srv_name: str, qos: Any) -> Service:

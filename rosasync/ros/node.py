@@ -40,7 +40,7 @@ DIRECT_TRIED = ("rmw_fastrtps_cpp", "rmw_fastrtps_dynamic_cpp")
 """The middlewares for which ``bridge="auto"`` chooses the direct bridge."""
 
 JOIN_TIMEOUT = 5.0
-"""Seconds for the executor thread to finish the callback under way."""
+"""Seconds to wait for the executor thread to finish its current callback."""
 
 Bridge = DirectBridge | ExecutorBridge
 
@@ -152,7 +152,7 @@ class RosNode:
         return self._graph.count_servers(service)
 
     def count_clients(self, service: Service) -> int:
-        """Return how many clients have the name, of all processes."""
+        """Return how many clients have the name, in all processes."""
         return self._graph.count_clients(service)
 
     def find_servers(self, service: Service) -> frozenset[Hashable]:
@@ -189,7 +189,7 @@ class RosNode:
             self._bridge.close()
         if self._thread is not None:
             self._thread.close()
-        # Not kept afterwards: a MultiThreadedExecutor ends its threads when it is collected.
+        # Drop the reference: a MultiThreadedExecutor ends its threads when it is collected.
         executor, self._user_executor = self._user_executor, None
         if executor is not None and self._node.executor is executor:
             self._node.executor = None
@@ -262,7 +262,7 @@ class RosNode:
         return DirectBridge(self._node, librcl, self._loop, self._introspect, options.busy_poll)
 
     def _introspect(self, entity: Any) -> None:
-        """Have a client or service publish its calls, if the session wants it."""
+        """Make a client or service publish its calls, as ``introspection`` says."""
         if self._introspection != "off":
             state = getattr(ServiceIntrospectionState, self._introspection.upper())
             clock = self._node.get_clock()
@@ -309,7 +309,7 @@ def _qos_of(service: Service) -> QoSProfile:
 
 
 def _takes_callbacks(executor: Executor | None) -> bool:
-    """Return whether this executor sets the middleware's callbacks itself, as EventsExecutor."""
+    """Return whether this executor sets the middleware's callbacks itself, like EventsExecutor."""
     return any(kind.__name__ == "EventsExecutor" for kind in type(executor).__mro__)
 
 

@@ -37,7 +37,7 @@ class Rcl:
         self._add_guard.argtypes = [*pointers[:2], ctypes.POINTER(ctypes.c_size_t)]
 
     def signal_responses(self, client: Any, fd: int | None) -> bool:
-        """Have an eventfd count the client's new responses; None ends it.
+        """Make an eventfd count the client's new responses; None ends it.
 
         Returns:
             False if the middleware does not support it or the client was destroyed.
@@ -45,7 +45,7 @@ class Rcl:
         return _set_callback(self._on_response, client, self._signal, fd)
 
     def signal_requests(self, service: Any, fd: int | None) -> bool:
-        """Have an eventfd count the service's new requests; None ends it.
+        """Make an eventfd count the service's new requests; None ends it.
 
         Returns:
             False if the middleware does not support it or the service was destroyed.
@@ -70,8 +70,8 @@ def _set_callback(function: Any, handle: Any, signal: Any, fd: int | None) -> bo
         return False
     if fd is None:
         return bool(function(handle.pointer, None, None) == 0)
-    # rmw_fastrtps counts what has come and then installs its listener: what comes in between is
-    # neither counted nor signalled. The second call counts it.
+    # rmw_fastrtps counts the queued messages and then installs its listener. A message that arrives
+    # in between is neither counted nor signalled, so a second call counts it.
     return all(function(handle.pointer, signal, ctypes.c_void_p(fd)) == 0 for _ in range(2))
 
 

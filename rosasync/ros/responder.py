@@ -1,4 +1,4 @@
-"""Sending responses, without blocking again and again for a client that cannot get them."""
+"""Sending responses, without blocking repeatedly for a client that cannot receive them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from rosasync.ros.failures import RclpyError, explain, is_destroyed, uses_node
 __all__ = ["Responder", "client_of"]
 
 SLOW_SEND = 0.05
-"""Seconds from which on a send may have waited for its client."""
+"""Seconds from which a send is slow: it may have waited for a client that is not matched."""
 WATCH_TIME = 3.0
 """Seconds after a failed send for which the graph is checked before every send."""
 POLL_INTERVAL = 0.05
@@ -35,14 +35,14 @@ POLL_INTERVAL = 0.05
 MATCH_DELAY = 0.05
 """Seconds for which a client has to be visible before a failed send to it is repeated."""
 MOST_UNREACHED = 1000
-"""Clients that are remembered as unreached at the most."""
+"""Maximum number of clients that are remembered as unreached."""
 
 INFO = struct.Struct("<qq16sq")
 """``rmw_service_info_t``: two timestamps, and a request id of a GUID and a sequence number."""
 
 # rclpy reports a failed send by a RuntimeWarning only, which the filters of the program may ignore.
-# CPython stores the version of the filters in the registry of the module that warns, for every
-# warning and before it applies them: afterwards the registry is not empty.
+# But for every warning, before it applies the filters, CPython stores their version in the registry
+# of the module that warns. So a registry that is not empty shows that there was a warning.
 __warningregistry__: dict[Any, Any] = {}
 
 
@@ -51,7 +51,7 @@ class Unreached:
     """A client that a send has not reached.
 
     Attributes:
-        visible_since: when the graph showed its reader first, after the failure.
+        visible_since: when the graph first showed its reader after the failure.
         given_up: whether another send has failed although the graph showed the reader.
     """
 
@@ -99,10 +99,10 @@ class Responder:
     """Sends the responses of one service. Its methods may be called on any thread.
 
     The middleware waits for a client that is not matched, by default for 0.1 s, and then drops the
-    response. A client is not matched if a packet of its discovery was lost, or if its QoS does not
-    fit. rclpy holds the GIL meanwhile, so the whole process stops. To prevent a second stop, the
-    client is identified after a slow send. Further responses to it are sent only when the graph
-    shows that they can arrive.
+    response. rclpy holds the GIL during that time, so the whole process stops. A client is not
+    matched if a packet of its discovery was lost, or if its QoS does not fit. After a slow send,
+    the client is identified. Further responses to it are sent only when the graph shows that they
+    can arrive, so that one client stops the process only once.
     """
 
     def __init__(self, node: Node, service: Service, qos: QoSProfile) -> None:
@@ -134,7 +134,7 @@ class Responder:
         except RclpyError as error:
             raise self._failure(error) from error
         except SystemError as error:
-            # rclpy does not expect that a filter turns its warning into an error.
+            # A filter has turned the warning into an error, which rclpy does not handle.
             if not isinstance(error.__cause__, RuntimeWarning):
                 raise
             __warningregistry__.clear()
@@ -159,7 +159,7 @@ class Responder:
         return Undeliverable(str(error))
 
     def _after_slow_send(self, header: RequestHeader) -> None:
-        """Find out whether the response was sent at last, or dropped."""
+        """Raise if the middleware dropped the response after it had waited."""
         warned = bool(__warningregistry__)
         __warningregistry__.clear()
         guid = client_of(header)

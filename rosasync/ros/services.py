@@ -1,4 +1,4 @@
-"""What the services of both bridges have in common."""
+"""Functions for the services of both bridges."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def take_request(take: Callable[[Any], Any], request_type: type) -> tuple[Any, A
     """Take a request by a handle's ``service_take_request``.
 
     Returns:
-        The request and its header, or None if there was none, or one that cannot be read.
+        The request and its header; None if there was no request, or one that cannot be read.
     """
     try:
         request, header = take(request_type)
@@ -44,10 +44,10 @@ def take_request(take: Callable[[Any], Any], request_type: type) -> tuple[Any, A
 
 
 def take_requests(take: Callable[[Any], Any], request_type: type, most: int) -> list[Any]:
-    """Take ``most`` times and return the pairs of request and header that came.
+    """Take ``most`` times and return the pairs of request and header.
 
-    A request that cannot be read does not hide those behind it, although the middleware reports
-    it either as an error, which is logged, or as an empty queue.
+    The middleware reports a request that cannot be read as an error, which is logged, or as an
+    empty queue. So neither ends the loop: further requests may follow.
     """
     taken = []
     for _ in range(most):

@@ -12,11 +12,17 @@ __all__ = ["Signal", "Signals"]
 M = TypeVar("M")
 
 MOST = 16
-"""Eventfds of a kind at the most: enough to tell members apart, without using up descriptors."""
+"""Maximum number of eventfds of one kind. More would locate members better, but use descriptors."""
 
 
 class Signal(Generic[M]):
-    """An eventfd, the members that share it, and those of them that wait for something."""
+    """An eventfd, and the members that share it.
+
+    Attributes:
+        members: the members. Written by `Signals`.
+        waiting: those that wait for something, the last to begin waiting last. Written by them.
+        fd: the file descriptor.
+    """
 
     def __init__(
         self, loop: asyncio.AbstractEventLoop, take: Callable[[Signal[M], int], None]
@@ -33,7 +39,7 @@ class Signal(Generic[M]):
             raise
 
     def close(self) -> None:
-        """Close the eventfd, when the middleware does not write to it any more."""
+        """Close the eventfd. The middleware must have stopped writing to it."""
         if not self._loop.is_closed():
             self._loop.remove_reader(self.fd)
         os.close(self.fd)
@@ -93,7 +99,7 @@ class Signals(Generic[M]):
         return signal
 
     def leave(self, member: M, signal: Signal[M]) -> None:
-        """Remove a member for which the middleware does not signal any more; idempotent."""
+        """Remove a member; idempotent. The middleware must have stopped signalling for it."""
         signal.members.pop(member, None)
         signal.waiting.pop(member, None)
         if not signal.members and len(self._signals) > 1 and signal in self._signals:

@@ -42,8 +42,8 @@ class FakeServer:
     """A server in a `FakeGraph`.
 
     Attributes:
-        depth: how many requests its queue holds while requests are held. Further ones are silently
-            lost, as in the middleware.
+        depth: the maximum number of requests in its queue while requests are held. Further ones are
+            silently lost, as in the middleware.
         received: the requests handled, in order.
         lost: the number of requests lost.
     """
@@ -64,15 +64,17 @@ class FakeServer:
             self.graph.servers.remove(self)
             self.graph.changed()
 
-    def _take(self, client: FakeClient, number: int, request: Any) -> None:
+    def receive(self, client: FakeClient, number: int, request: Any) -> None:
+        """Queue a request, or lose it if the queue is full; handle it at once unless held."""
         if self.graph.holding and len(self._queue) >= self.depth:
             self.lost += 1
             return
         self._queue.append((client, number, request))
         if not self.graph.holding:
-            self._work()
+            self.handle_queued()
 
-    def _work(self) -> None:
+    def handle_queued(self) -> None:
+        """Handle the queued requests and send their responses."""
         while self._queue:
             client, number, request = self._queue.popleft()
             self.received.append(request)
@@ -83,7 +85,7 @@ class FakeServer:
 
 @dataclass(frozen=True)
 class FakeHeader:
-    """The header of a request in memory, a `rosasync.ports.RequestHeader`. It is its own id."""
+    """The header of a request in memory: a `rosasync.ports.RequestHeader`, and its own id."""
 
     client: FakeClient
     sequence_number: int
@@ -142,7 +144,8 @@ class FakeService(FakeServer):
         """Stop delivering requests; idempotent."""
         self._stopped = True
 
-    def _work(self) -> None:
+    def handle_queued(self) -> None:
+        """Deliver the queued requests to the session, in the next turn of its loop."""
         while self._queue:
             client, number, request = self._queue.popleft()
             self.received.append(request)
@@ -192,29 +195,29 @@ class FakeGraph:
         asyncio.get_running_loop().call_soon(self.changed)
 
     def delay_responses(self, seconds: float) -> AbstractContextManager[None]:
-        """In this block, delay responses by a number of seconds."""
-        return self._meanwhile("delay", seconds)
+        """Delay responses by a number of seconds, in this block."""
+        return self._set_in_block("delay", seconds)
 
     def drop_requests(self) -> AbstractContextManager[None]:
-        """In this block, lose every request sent."""
-        return self._meanwhile("dropping_requests", True)
+        """Lose every request that is sent in this block."""
+        return self._set_in_block("dropping_requests", True)
 
     def drop_responses(self) -> AbstractContextManager[None]:
-        """In this block, lose the response to every request handled."""
-        return self._meanwhile("dropping_responses", True)
+        """Lose the response to every request that is handled in this block."""
+        return self._set_in_block("dropping_responses", True)
 
     @contextmanager
     def hold_requests(self) -> Iterator[None]:
-        """In this block, queue the requests, up to each server's depth; handle them afterwards."""
+        """Queue requests in this block, up to each server's depth, and handle them at its end."""
         try:
-            with self._meanwhile("holding", True):
+            with self._set_in_block("holding", True):
                 yield
         finally:
             for server in tuple(self.servers):
-                server._work()
+                server.handle_queued()
 
     @contextmanager
-    def _meanwhile(self, name: str, value: object) -> Iterator[None]:
+    def _set_in_block(self, name: str, value: object) -> Iterator[None]:
         before = getattr(self, name)
         setattr(self, name, value)
         try:
@@ -223,7 +226,7 @@ class FakeGraph:
             setattr(self, name, before)
 
     def find(self, srv_type: str, srv_name: str) -> list[FakeServer]:
-        """Return the servers of this type's name and this name."""
+        """Return the servers of a service, by the names of its type and the service."""
         return [
             server
             for server in self.servers
@@ -331,14 +334,14 @@ class FakeNode:
         return f"the graph has {sorted(server.srv_name for server in self.graph.servers)}"
 
     def stop(self) -> None:
-        """There is no thread."""
+        """Do nothing: there is no thread."""
 
     def join(self) -> bool:
-        """There is no thread."""
+        """Return True: there is no thread."""
         return True
 
     async def stopped(self) -> None:
-        """There is no thread."""
+        """Return at once: there is no thread."""
 
     def close(self) -> None:
         """Leave the graph; idempotent."""
@@ -351,8 +354,8 @@ class FakeClient:
 
     Attributes:
         sent: the numbers of the requests sent, in order.
-        out: those whose response is still expected.
-        most: most requests outstanding at once.
+        out: the numbers of the outstanding requests.
+        most: the maximum number of requests outstanding at once so far.
     """
 
     def __init__(self, node: FakeNode, key: ServiceKey, deliver: Deliver) -> None:
@@ -373,16 +376,16 @@ class FakeClient:
         self.most = max(self.most, len(self.out))
         if not self.node.graph.dropping_requests:
             for server in self.node.graph.find(self.srv_type, self.srv_name):
-                server._take(self, number, request)
+                server.receive(self, number, request)
         return number
 
     def later(self, delay: float, number: int, response: Any) -> None:
-        """Deliver a response, ``delay`` seconds from now but never at once."""
+        """Deliver a response after ``delay`` seconds, but not in this turn of the loop."""
         loop = asyncio.get_running_loop()
         loop.call_later(delay, self.deliver, number, response)
 
     def deliver(self, number: int, response: Any) -> None:
-        """Deliver a response, now."""
+        """Deliver a response at once, unless the client is closed."""
         self.out.discard(number)
         if not self.closed:
             self._deliver(number, response)

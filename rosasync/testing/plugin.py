@@ -1,4 +1,4 @@
-"""The pytest plugin: fixtures for a graph in memory and for a ROS domain of the run's own."""
+"""The pytest plugin: fixtures for a graph in memory and for an unused ROS domain."""
 
 from __future__ import annotations
 
@@ -18,5 +18,5 @@ def fake_graph() -> FakeGraph:
 
 @pytest.fixture(scope="session")
 def ros_domain() -> int:
-    """A ROS domain of the test run's own; see `rosasync.ros.domain.isolate`."""
+    """A ROS domain that only this test run uses; see `rosasync.ros.domain.isolate`."""
     return isolate()

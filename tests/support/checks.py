@@ -1,4 +1,4 @@
-"""What a test checks when the calls are over."""
+"""Checks for the end of a test."""
 
 from __future__ import annotations
 
@@ -32,24 +32,24 @@ __all__ = [
 
 @dataclass
 class Takes:
-    """How often clients looked for a response, and how many the middleware handed to them."""
+    """The number of times clients tried to take a response, and of the responses they took."""
 
-    looks: int = 0
+    attempts: int = 0
     responses: int = 0
 
 
 @contextmanager
 def count_takes() -> Iterator[Takes]:
-    """Count what the clients of the sessions that are opened meanwhile take.
+    """Count the responses taken by clients of the sessions that are opened in this block.
 
-    So what the middleware has lost is told from what the library has lost.
+    They distinguish responses that the middleware has lost from those that the library has lost.
     """
     takes = Takes()
     take_response = _rclpy.Client.take_response
 
     def counted(client: Any, response_type: Any) -> Any:
         taken = take_response(client, response_type)
-        takes.looks += 1
+        takes.attempts += 1
         takes.responses += taken[0] is not None
         return taken
 
@@ -71,7 +71,7 @@ async def assert_clean(session: Session) -> None:
         now = session.pool.statistics()
         return now.in_flight == now.waiting == now.abandoned == 0
 
-    # A place that waits for a response the middleware has lost comes back after Limits.grace.
+    # If the middleware has lost a response, its place is only freed after Limits.grace.
     await until(settled, 2 * LIMIT)
     now = session.pool.statistics()
     assert now.idle == now.clients
@@ -81,7 +81,7 @@ async def assert_clean(session: Session) -> None:
 
 
 def pending_in_rclpy(session: Session) -> int:
-    """Return how many requests rclpy itself still keeps an entry for."""
+    """Return the number of requests that rclpy itself still keeps."""
     return sum(len(client._pending_requests) for client in session.node.clients)
 
 
@@ -89,7 +89,7 @@ def take_what_is_left(session: Session) -> int:
     """Take the responses that the clients have not taken; return how many there were."""
     found = 0
     for client in session.node.clients:
-        # One take that gives nothing does not mean that nothing is left.
+        # A take without a result does not mean that the queue is empty.
         for _ in range(100):
             found += client.handle.take_response(client.srv_type.Response)[0] is not None
     return found

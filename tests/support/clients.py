@@ -73,7 +73,7 @@ class ClientProcess(Child):
             depth: the depth of their history; None for the default of ROS, 10.
             block: seconds for which the process is busy before it takes its next responses.
             timeout: seconds after which a call without a response counts as lost.
-            tag: the beginning of the text of every request, to tell processes apart.
+            tag: the beginning of the text of every request, which identifies the process.
         """
         await self.ask(
             "start",

@@ -1,4 +1,4 @@
-"""The requests of the tests and their responses, which tell what request they answer."""
+"""Requests and responses for the tests. Each response identifies its request."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def response_to(request: Any) -> str:
 
 
 def fill(request: Any, response: Any) -> Any:
-    """Fill a new response so that it tells which request it answers."""
+    """Fill a new response so that it identifies its request."""
     text = response_to(request)
     filler = _FILLERS.get(type(response).__name__.removesuffix("_Response"))
     if filler is not None:

@@ -1,4 +1,4 @@
-"""The ROS side of a session without the session: nodes, and what their ports deliver."""
+"""Nodes and their ports without a session."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Opened:
 
     @property
     def port(self) -> NodePort:
-        """The node as the core sees it."""
+        """The node, typed as the port that the core uses."""
         return self.ros
 
     def service(self, name: str = "/echo", srv_type: Any = ECHO, qos: Any = None) -> Service:
@@ -124,7 +124,7 @@ def borrowed_node(name: str = "lender") -> Iterator[Any]:
 
 
 class Reports(list[dict[str, Any]]):
-    """What the loop's exception handler was told."""
+    """The reports to the loop's exception handler."""
 
     @property
     def errors(self) -> list[str]:
@@ -133,7 +133,7 @@ class Reports(list[dict[str, Any]]):
 
 @contextmanager
 def reports() -> Iterator[Reports]:
-    """Collect what reaches the loop's exception handler meanwhile."""
+    """Collect the reports to the loop's exception handler in this block."""
     loop = asyncio.get_running_loop()
     collected = Reports()
     before = loop.get_exception_handler()

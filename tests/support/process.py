@@ -36,7 +36,7 @@ _PROFILE_VARIABLE = (
 )
 
 # Every test opens new sessions. A process that announces itself every 0.2 s instead of every 3 s is
-# found at once, even by a session that takes the place of another. A response waits up to 3 s for
+# found at once, even by a session that replaces another. A response waits up to 3 s for
 # its client to be matched: if a discovery packet is lost, the usual 0.1 s is not enough.
 _PROFILE = """<?xml version="1.0" encoding="UTF-8" ?>
 <profiles xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">

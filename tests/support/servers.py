@@ -35,7 +35,7 @@ seconds between two, when `ServerProcess.release` is called, or never."""
 
 @contextmanager
 def running(program: Path) -> Iterator[None]:
-    """Run a program of the documentation that serves what others call meanwhile."""
+    """Run a program of the documentation that serves the calls of this block."""
     command = (sys.executable, str(program))
     with (
         profile() as environment,

@@ -1,4 +1,4 @@
-"""Handlers that echo, in every form a server takes, and what a test looks at in a server."""
+"""Handlers that echo, in every form that a server accepts, and helpers for their tests."""
 
 from __future__ import annotations
 
@@ -57,14 +57,14 @@ def ask(session: Session, name: str, text: str, **options: Any) -> asyncio.Task[
 
 
 async def discard(*tasks: asyncio.Task[Any]) -> None:
-    """Cancel tasks, and let none of their errors go unseen."""
+    """Cancel tasks, and retrieve their errors so that asyncio does not log them."""
     for task in tasks:
         task.cancel()
     await asyncio.gather(*tasks, return_exceptions=True)
 
 
 class Holder:
-    """A handler that answers nothing: it keeps the calls, for the test to answer."""
+    """A handler that keeps its calls, for the test to answer."""
 
     def __init__(self) -> None:
         self.calls: list[AnyCall] = []
@@ -73,7 +73,7 @@ class Holder:
         self.calls.append(call)
 
     async def held(self, count: int) -> list[AnyCall]:
-        """Wait until so many calls have come."""
+        """Wait until ``count`` calls have arrived, and return all."""
         await until(lambda: len(self.calls) >= count)
         return self.calls
 
@@ -138,15 +138,15 @@ async def serving(session: Session, name: str, form: str) -> AsyncIterator[AnySe
 async def settled(server: AnyServer) -> None:
     """Wait until nothing runs, waits or is unanswered."""
 
-    def rests() -> bool:
+    def idle() -> bool:
         now = server.statistics()
         return now.running == now.waiting == now.unanswered == 0
 
-    await until(rests)
+    await until(idle)
 
 
 class UnmatchedClients:
-    """Has a server's responses find their clients not discovered yet, for as long as it says.
+    """Makes a server's responses fail as if their clients were not discovered yet.
 
     Attributes:
         unmatched: whether sends fail now.

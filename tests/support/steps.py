@@ -29,7 +29,7 @@ class Victim:
     """
 
     def __init__(self, coroutine: Coroutine[Any, Any, Any], suspension: int, moment: Moment):
-        self.struck = False
+        self.cancelled = False
         self.suspensions = 0
         self._target = suspension
         self.moment = moment
@@ -43,15 +43,15 @@ class Victim:
         if number != self._target:
             return
         if self.moment == "as it suspends":
-            self._strike()
+            self._cancel()
         elif self.moment == "in the next turn" or awaited is None:
-            self.task.get_loop().call_soon(self._strike)
+            self.task.get_loop().call_soon(self._cancel)
         else:
-            awaited.add_done_callback(lambda _: self._strike())
+            awaited.add_done_callback(lambda _: self._cancel())
 
-    def _strike(self) -> None:
+    def _cancel(self) -> None:
         if not self.task.done():
-            self.struck = True
+            self.cancelled = True
             self.task.cancel()
 
 
@@ -66,13 +66,13 @@ async def every_victim(
         moments: the moments to try at each await.
     """
     for suspension in itertools.count():
-        struck = False
+        cancelled = False
         for moment in moments:
             victim = Victim(make(), suspension, moment)
             yield victim
             assert victim.task.done(), "the test has to wait for its victim"
-            struck = struck or victim.struck
-        if not struck:
+            cancelled = cancelled or victim.cancelled
+        if not cancelled:
             assert suspension > 0, "the call never waits, so nothing was tested"
             return
 
