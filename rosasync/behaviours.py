@@ -352,7 +352,7 @@ class WaitForService(ServiceBehaviour[Any, Any]):
         if state is ProxyState.WAITING:
             return Status.RUNNING
         if state is ProxyState.SERVICE_AVAILABLE:
-            self.feedback_message = f"{self.srv_name} is available"
+            self.feedback_message = f"{self.srv_name} is there"
             return Status.SUCCESS
         self.feedback_message = "; ".join(map(str, proxy.get_errors())) or "aborted"
         return Status.FAILURE

@@ -140,7 +140,7 @@ class ClientSet:
         """Return whether a client is matched with a server."""
         return any(self.is_matched(client) for client in self)
 
-    def has_lost_requests(self) -> bool:
+    def find_lost_requests(self) -> bool:
         """Return whether a request has lost all its servers, even if there are new ones."""
         if self.servers_gone():
             return True

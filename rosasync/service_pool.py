@@ -267,7 +267,7 @@ class ServicePool:
         if self._queue or self._ready_waiters:
             self._dispatch()
         outstanding = self._counts.in_flight or self._clients.abandoned
-        if outstanding and self._gone_timer is None and self._clients.has_lost_requests():
+        if outstanding and self._gone_timer is None and self._clients.find_lost_requests():
             self._gone_timer = self._loop.call_later(GONE_DELAY, self._end_requests)
 
     # The queue.

@@ -195,7 +195,7 @@ class TestWaitForService:
         assert leaf.feedback_message == "waiting for /new"
         graph.serve(ECHO, "/new", lambda _: None)
         assert await ticked(leaf) is Status.SUCCESS
-        assert leaf.feedback_message == "/new is available"
+        assert leaf.feedback_message == "/new is there"
 
     async def test_it_fails_at_the_deadline(self, fake_session: Session) -> None:
         leaf = ready(WaitForService("wait", ECHO, "/new", timeout=TICK), fake_session)
