@@ -26,23 +26,8 @@ from rosasync import (
     UsageError,
 )
 from rosasync.testing import FakeClient, FakeGraph, FakeNode
+from tests.support.plain import Echo, echo
 from tests.support.times import TICK, until
-
-
-class Echo:
-    """A service of plain Python."""
-
-    class Request:
-        def __init__(self, value: object = None) -> None:
-            self.value = value
-
-    class Response:
-        def __init__(self, value: object = None) -> None:
-            self.value = value
-
-
-def echo(request: Echo.Request) -> Echo.Response:
-    return Echo.Response(request.value)
 
 
 @asynccontextmanager

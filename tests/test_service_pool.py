@@ -22,23 +22,8 @@ from rosasync import (
 from rosasync.graph_watch import POLL_MAX
 from rosasync.ports import PortDestroyed
 from rosasync.testing import FakeClient, FakeGraph
+from tests.support.plain import Echo, echo
 from tests.support.times import LIMIT, TICK, until
-
-
-class Echo:
-    """A service of plain Python."""
-
-    class Request:
-        def __init__(self, value: object = None) -> None:
-            self.value = value
-
-    class Response:
-        def __init__(self, value: object = None) -> None:
-            self.value = value
-
-
-def echo(request: Echo.Request) -> Echo.Response:
-    return Echo.Response(request.value)
 
 
 async def ask(session: Session, value: object, **options: Any) -> object:

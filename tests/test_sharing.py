@@ -10,28 +10,13 @@ import pytest
 
 from rosasync import Limits, ResponseTimeout, Retry, ServerGone, Session
 from tests.support.echo import ECHO, request_of
+from tests.support.plain import Echo, echo
 from tests.support.times import LIMIT, TICK, until
 
 if TYPE_CHECKING:
     from rosasync.testing import FakeGraph
     from tests.conftest import Bridge
     from tests.support.servers import ServerProcess
-
-
-class Echo:
-    """A service of plain Python."""
-
-    class Request:
-        def __init__(self, value: object = None) -> None:
-            self.value = value
-
-    class Response:
-        def __init__(self, value: object = None) -> None:
-            self.value = value
-
-
-def echo(request: Echo.Request) -> Echo.Response:
-    return Echo.Response(request.value)
 
 
 def in_flight(session: Session) -> int:
