@@ -423,7 +423,11 @@ class ServicePool:
     def _count_failure(self, call: Call, error: BaseException, started: float) -> BaseException:
         """Count a failed call, and return the error in the caller's terms."""
         counts = self._counts
-        error = self._translate(call, error, started)
+        try:
+            error = self._translate(call, error, started)
+        except Exception as failure:
+            # The node went down before the graph could be asked.
+            error = failure
         if isinstance(error, asyncio.CancelledError):
             counts.cancelled += 1
             if call.started and not call.future.cancelled() and call.future.exception() is None:

@@ -387,3 +387,16 @@ def test_servers_of_the_fake_graph_are_told_apart() -> None:
     second.close()
     assert len(graph.servers) == 1
     assert graph.servers[0] is first
+
+
+async def test_a_call_whose_error_cannot_be_explained_is_counted(fake_graph: FakeGraph) -> None:
+    async with fake_graph.session() as session:
+        node: Any = session.node
+
+        def explain_missing(_: object) -> str:
+            raise ContextShutdown
+
+        node.explain_missing = explain_missing
+        with pytest.raises(ContextShutdown):
+            await ask(session, 1, timeout=0.0)
+        assert session.pool.statistics().failed == 1
