@@ -41,7 +41,7 @@ class Client:
         leases: how many callers may send.
         matched_generation: the generation of the graph in which a server was last seen matched.
             Written by the `ServicePool`.
-        idle_since: the loop time at which the last lease ended.
+        idle_since: the loop time at which the last lease ended. Written by the `ClientSet` as well.
     """
 
     __slots__ = (
@@ -144,7 +144,8 @@ class Client:
 
     def abandon(self, sequence_number: int) -> None:
         """Keep a place for a request that has lost its caller."""
-        if self.closed:
+        # The loop is closed if a task that was still pending is collected.
+        if self.closed or self._loop.is_closed():
             return
         ends = self._loop.time() + self._grace
         self._abandoned[sequence_number] = ends

@@ -167,6 +167,12 @@ class ClientSet:
         if self._evict_timer is None:
             self._evict_at(self._loop.time() + self._limits.idle)
 
+    def touch(self) -> None:
+        """Begin the idle time of the clients again."""
+        now = self._loop.time()
+        for client in self._clients:
+            client.idle_since = now
+
     def drop(self, client: Client) -> None:
         """Remove a client that was destroyed by other means, such as ``Node.destroy_client``."""
         if client in self._clients:

@@ -123,8 +123,8 @@ class Core:
         """End the executor thread when the interpreter exits, which would abort on it."""
         session = self._session()
         if session is not None and not self.closed:
-            self.closed = True
             _warn_unclosed(session)
+            self.closed = True
         elif self.closed and self.loop.is_closed():
             self._cleaned_up.wait(END_TIMEOUT)
         self.node.stop()

@@ -233,10 +233,11 @@ class ServicePool:
                 return
 
     def is_ready(self) -> bool:
-        """Return whether a client is matched with a server."""
+        """Return whether a client is matched with a server. To ask is a use of the clients."""
         self.check_open()
         if not self._clients:
             self._clients.open()
+        self._clients.touch()
         self._watch.keep_polling()
         return self._clients.any_matched()
 
@@ -296,7 +297,7 @@ class ServicePool:
             self._schedule_dispatch()
 
     def _schedule_dispatch(self) -> None:
-        if not self._dispatch_scheduled:
+        if not self._dispatch_scheduled and not self._loop.is_closed():
             self._dispatch_scheduled = True
             self._loop.call_soon(self._run_dispatch)
 
