@@ -46,7 +46,7 @@ class Client:
         leases: the number of open leases. `ClientSet.lease` adds one, `release` ends one.
         matched_generation: the generation of the graph in which a server was last seen matched.
             Written by the `ClientSet`.
-        idle_since: the loop time at which the last lease ended.
+        idle_since: the loop time at which the last lease ended. Written by the `ClientSet` as well.
         servers: the servers that receive the requests sent now; None if they are not known yet.
             Reset by the `ClientSet` when the graph has changed.
         window: the number of places. Written by the `ClientSet`.
@@ -199,7 +199,8 @@ class Client:
             sequence_number: the number of the request.
             servers: the servers that had the request, None if not known yet.
         """
-        if self.closed:
+        # The loop is closed if a task that was still pending is collected.
+        if self.closed or self._loop.is_closed():
             return
         ends = self._loop.time() + self._grace
         self._abandoned[sequence_number] = ends, servers

@@ -212,6 +212,12 @@ class ClientSet:
             if grows:
                 self._on_capacity()
 
+    def touch(self) -> None:
+        """Begin the idle time of the clients again."""
+        now = self._loop.time()
+        for client in self._clients:
+            client.idle_since = now
+
     def drop(self, client: Client) -> None:
         """Remove a client that other code has destroyed, for example by ``Node.destroy_client``."""
         if client in self._clients:

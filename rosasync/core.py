@@ -124,8 +124,8 @@ class Core:
         """End the executor thread, because the interpreter aborts if it exits while one spins."""
         session = self._session()
         if session is not None and not self.closed:
-            self.closed = True
             _warn_unclosed(session)
+            self.closed = True
         elif self.closed and self.loop.is_closed():
             self._cleaned_up.wait(END_TIMEOUT)
         self.node.stop()

@@ -234,10 +234,11 @@ class ServicePool:
                 return
 
     def is_ready(self) -> bool:
-        """Return whether a client is matched with a server."""
+        """Return whether a client is matched with a server. To ask is a use of the clients."""
         self.check_open()
         if not self._clients:
             self._clients.open()
+        self._clients.touch()
         self._watch.keep_polling()
         return self._clients.any_matched()
 
@@ -298,7 +299,7 @@ class ServicePool:
             self._schedule_dispatch()
 
     def _schedule_dispatch(self) -> None:
-        if not self._dispatch_scheduled:
+        if not self._dispatch_scheduled and not self._loop.is_closed():
             self._dispatch_scheduled = True
             self._loop.call_soon(self._run_dispatch)
 
@@ -427,7 +428,11 @@ class ServicePool:
     def _count_failure(self, call: Call, error: BaseException, started: float) -> BaseException:
         """Count a failed call, and return the error to raise to the caller."""
         counts = self._counts
-        error = self._translate(call, error, started)
+        try:
+            error = self._translate(call, error, started)
+        except Exception as failure:
+            # The node went down before the graph could be asked.
+            error = failure
         if isinstance(error, asyncio.CancelledError):
             counts.cancelled += 1
             if call.started and not call.future.cancelled() and call.future.exception() is None:

@@ -62,13 +62,13 @@ class TestLeftOpen:
     async def test_held_by_the_program(self, bridge: Bridge) -> None:
         code, errors = await run(bridge, "session = asyncio.run(opened(bridge))")
         assert code == 0, errors
-        assert "ResourceWarning: unclosed <Session 'left_open'" in errors
+        assert f"ResourceWarning: unclosed <Session 'left_open' {bridge} bridge" in errors
         assert "Traceback" not in errors
 
     async def test_dropped_by_the_program(self, bridge: Bridge) -> None:
         code, errors = await run(bridge, "asyncio.run(opened(bridge))")
         assert code == 0, errors
-        assert "ResourceWarning: unclosed <Session 'left_open'" in errors
+        assert f"ResourceWarning: unclosed <Session 'left_open' {bridge} bridge" in errors
         assert "Traceback" not in errors
 
     async def test_dropped_in_a_loop_that_goes_on(self, bridge: Bridge) -> None:

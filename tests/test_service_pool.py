@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import logging
 from typing import Any
 
@@ -371,3 +372,54 @@ def test_servers_of_the_fake_graph_are_told_apart() -> None:
     second.close()
     assert len(graph.servers) == 1
     assert graph.servers[0] is first
+
+
+async def test_a_call_whose_error_cannot_be_explained_is_counted(fake_graph: FakeGraph) -> None:
+    async with fake_graph.session() as session:
+        node: Any = session.node
+
+        def explain_missing(_: object) -> str:
+            raise ContextShutdown
+
+        node.explain_missing = explain_missing
+        with pytest.raises(ContextShutdown):
+            await ask(session, 1, timeout=0.0)
+        assert session.pool.statistics().failed == 1
+
+
+async def test_who_asks_whether_a_server_is_there_uses_the_client(fake_graph: FakeGraph) -> None:
+    async with fake_graph.session() as session:
+        assert not session.service_is_ready(Echo, "/echo")
+        (client,) = session.pool.service(Echo, "/echo", None).clients
+        created = client.idle_since
+        await asyncio.sleep(TICK / 10)
+        assert not session.service_is_ready(Echo, "/echo")
+        assert client.idle_since > created
+
+
+def test_calls_that_are_collected_with_a_closed_loop_are_silent(fake_graph: FakeGraph) -> None:
+    async def leave() -> Session:
+        session = fake_graph.session(limits=Limits(in_flight=1))
+        await session.__aenter__()
+        await session.wait_for_service(Echo, "/echo")
+        with fake_graph.drop_requests():
+            calls.extend(session.start(Echo, "/echo", timeout=None) for _ in range(3))
+            await asyncio.sleep(0)
+        return session
+
+    calls: list[asyncio.Task[Any]] = []
+    fake_graph.serve(Echo, "/echo", echo)
+    loop = asyncio.new_event_loop()
+    # asyncio itself reports pending tasks that are destroyed.
+    loop.set_exception_handler(lambda _, context: None)
+    session = loop.run_until_complete(leave())
+    for call in calls:
+        call.cancel()
+    del call
+    loop.close()
+    calls.clear()
+    # An error in a coroutine that is collected would fail this test.
+    gc.collect()
+    assert session.pool.statistics().in_flight == 0
+    with pytest.warns(ResourceWarning, match="unclosed"):
+        session.core.abandon(session)
