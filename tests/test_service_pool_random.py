@@ -235,8 +235,8 @@ async def timers(monkeypatch: pytest.MonkeyPatch) -> Callable[[], set[str]]:
     [
         *((range(n, n + 2), 400) for n in range(0, 6, 2)),
         *(
-            pytest.param(range(n, n + 20), 3000, marks=pytest.mark.soak)
-            for n in range(100, 300, 20)
+            pytest.param(range(n, n + 10), 3000, marks=pytest.mark.soak)
+            for n in range(100, 150, 10)
         ),
     ],
 )
