@@ -59,7 +59,6 @@ class Client:
         "_loop",
         "_on_capacity",
         "_port",
-        "_reserved",
         "_superseded",
         "closed",
         "counts",
@@ -81,7 +80,6 @@ class Client:
     ) -> None:
         self._loop = asyncio.get_running_loop()
         self.window = limits.in_flight
-        self._reserved = int(limits.in_flight > 1)
         self._grace = limits.grace
         self._on_capacity = on_capacity
         self.unanswered: dict[int, Call] = {}
@@ -113,13 +111,9 @@ class Client:
     def capacity(self) -> int:
         """How many more leases fit into the window.
 
-        It is negative while callers with leases wait for their places. Abandoned requests leave one
-        place to the next caller, unless calls are exclusive.
+        It is negative while callers with leases wait for their places.
         """
-        window = self.window
-        if abandoned := len(self._abandoned):
-            window -= min(abandoned, window - self._reserved)
-        return window - self.leases
+        return self.window - self.leases - len(self._abandoned)
 
     @property
     def is_idle(self) -> bool:

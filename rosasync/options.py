@@ -116,8 +116,9 @@ class Limits:
         idle: seconds after which an unused client is destroyed.
         grace: seconds for which a cancelled or timed-out request counts as outstanding, unless its
             late response arrives sooner. It may still be in the server's queue.
-        server_depth: the depth of the server's queue, which all clients of the name share. None if
-            it is deep enough for all of them, so that each may use its whole ``in_flight``.
+        server_depth: the depth of the server's queue, which all clients of the name share; a larger
+            ``in_flight`` says that it is deeper. None if it is deep enough for all of them, so that
+            each may use its whole ``in_flight``.
 
     Raises:
         TypeError: a value is not a number.
@@ -144,7 +145,8 @@ class Limits:
         """Return the window of each client, given the number of clients in the graph."""
         if self.server_depth is None:
             return self.in_flight
-        return min(self.in_flight, max(1, self.server_depth // max(1, clients)))
+        depth = max(self.server_depth, self.in_flight)
+        return min(self.in_flight, max(1, depth // max(1, clients)))
 
 
 @dataclass(frozen=True, slots=True)

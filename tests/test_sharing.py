@@ -38,6 +38,8 @@ def window(session: Session) -> int:
         (1, 10, 8, 1),
         (10, None, 16, 10),
         (10, 100, 4, 10),
+        (200, 10, 1, 200),
+        (200, 10, 4, 50),
         (10, 10, 0, 10),
     ],
 )
@@ -131,18 +133,6 @@ async def test_an_answer_gives_back_the_places_of_earlier_abandoned_requests(
         assert session.pool.statistics().abandoned == 3
         assert (await session.call(Echo, "/echo", Echo.Request(1))).value == 1
         assert session.pool.statistics().abandoned == 0
-
-
-async def test_abandoned_requests_leave_a_place_to_the_next_caller(fake_graph: FakeGraph) -> None:
-    fake_graph.serve(Echo, "/echo", echo)
-    async with fake_graph.session(limits=Limits(in_flight=2, grace=1000.0)) as session:
-        await session.call(Echo, "/echo", Echo.Request(0))
-        with fake_graph.drop_requests():
-            for _ in range(5):
-                with pytest.raises(ResponseTimeout):
-                    await session.call(Echo, "/echo", timeout=TICK / 5)
-        assert session.pool.statistics().abandoned == 5
-        assert (await session.call(Echo, "/echo", Echo.Request(1), timeout=LIMIT)).value == 1
 
 
 async def test_a_call_ends_when_its_server_is_replaced(fake_graph: FakeGraph) -> None:
