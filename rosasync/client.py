@@ -203,6 +203,8 @@ class Client:
 
     def forget_later(self, sequence_number: int) -> None:
         """Expect a late response for the grace period, without keeping a place for it."""
+        if self.closed or self._loop.is_closed():
+            return
         timer = self._loop.call_later(self._grace, self._forget, sequence_number)
         self._superseded[sequence_number] = timer
 
@@ -232,9 +234,11 @@ class Client:
 
         A server's queue keeps the order of one client's requests, so they have left it.
         """
-        for number in [number for number in self._abandoned if number < sequence_number]:
+        earlier = [number for number in self._abandoned if number < sequence_number]
+        for number in earlier:
             del self._abandoned[number]
             self.forget_later(number)
+        if earlier:
             self._on_capacity()
 
     def _end_grace(self) -> None:

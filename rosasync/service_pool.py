@@ -265,7 +265,7 @@ class ServicePool:
     def on_graph(self) -> None:
         """Check the graph again: the shares of the queue, the matches and the lost servers."""
         self._clients.share_queue()
-        if self._queue or self._ready_waiters:
+        if self._has_callers():
             self._dispatch()
         outstanding = self._counts.in_flight or self._clients.abandoned
         if outstanding and self._gone_timer is None and self._clients.find_lost_requests():

@@ -54,6 +54,15 @@ class ClientUnderTest:
         return task
 
 
+async def test_a_closed_client_starts_no_timer_for_a_late_response() -> None:
+    under_test = ClientUnderTest()
+    under_test.client.close()
+    loop = asyncio.get_running_loop()
+    before = len(loop._scheduled)  # type: ignore[attr-defined]
+    under_test.client.forget_later(1)
+    assert len(loop._scheduled) == before  # type: ignore[attr-defined]
+
+
 async def test_responses_find_their_callers_in_any_order() -> None:
     tested = ClientUnderTest()
     tasks = [await tested.calling() for _ in range(3)]
