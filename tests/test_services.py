@@ -13,7 +13,7 @@ from rosasync.errors import ContextShutdown
 from rosasync.ports import PortDestroyed, Undeliverable, Unmatched
 from rosasync.ros import responder
 from rosasync.ros.responder import (
-    MATCH_DELAY,
+    MATCH_DELAYS,
     MOST_UNREACHED,
     POLL_INTERVAL,
     WATCH_TIME,
@@ -25,7 +25,7 @@ from tests.support.times import LIMIT
 
 BLOCKED = 0.1
 """Seconds for which the middleware waits for a client."""
-STEP = 1.2 * max(POLL_INTERVAL, MATCH_DELAY)
+STEP = 1.2 * max(POLL_INTERVAL, MATCH_DELAYS[0])
 VOLATILE = QoSProfile(depth=10)
 TRANSIENT = QoSProfile(depth=10, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 
@@ -179,13 +179,27 @@ def test_one_that_cannot_be_matched_although_it_is_visible_is_given_up(
     middleware.unmatched.add(BAD)
     middleware.join(BAD)
     fail(service, BAD)
-    for _ in range(100):
+    for _ in range(int(2 * sum(MATCH_DELAYS) / STEP)):
         middleware.now += STEP
         with pytest.raises(Undeliverable):
             service.send(Header(BAD), "response")
-    assert middleware.sent == [BAD, BAD]
+    assert middleware.sent == [BAD] * (1 + len(MATCH_DELAYS))
     with pytest.raises(Undeliverable, match="does not match it"):
         service.send(Header(BAD), "response")
+
+
+def test_one_whose_match_takes_longer_than_a_send_waits_gets_its_response(
+    middleware: Middleware, service: Responder
+) -> None:
+    middleware.unmatched.add(BAD)
+    middleware.join(BAD)
+    for _ in range(len(MATCH_DELAYS)):
+        fail(service, BAD)
+        assert "just now" in fail(service, BAD)
+        middleware.now += MATCH_DELAYS[-1]
+    middleware.unmatched.clear()
+    service.send(Header(BAD), "response")
+    assert middleware.sent == [BAD] * (1 + len(MATCH_DELAYS))
 
 
 @pytest.mark.parametrize("report", ["error", "warning"])

@@ -32,8 +32,9 @@ WATCH_TIME = 3.0
 """Seconds after a failed send for which the graph is checked before every send."""
 POLL_INTERVAL = 0.05
 """Seconds between two queries of the graph."""
-MATCH_DELAY = 0.05
-"""Seconds for which a client has to be visible before a failed send to it is repeated."""
+MATCH_DELAYS = (0.05, 0.2, 0.8, 3.2)
+"""Seconds for which a client has to be visible before a failed send to it is repeated, and then
+between further sends. On a machine with other work a match may take longer than a send waits."""
 MOST_UNREACHED = 1000
 """Maximum number of clients that are remembered as unreached."""
 
@@ -51,12 +52,12 @@ class Unreached:
     """A client that a send has not reached.
 
     Attributes:
-        visible_since: when the graph first showed its reader after the failure.
-        given_up: whether another send has failed although the graph showed the reader.
+        failures: the number of sends that failed although the graph showed the reader.
+        due: when to send again; None until the graph shows the reader.
     """
 
-    visible_since: float | None = None
-    given_up: bool = False
+    failures: int = 0
+    due: float | None = None
 
 
 class ClientGraph:
@@ -102,7 +103,8 @@ class Responder:
     response. rclpy holds the GIL during that time, so the whole process stops. A client is not
     matched if a packet of its discovery was lost, or if its QoS does not fit. After a slow send,
     the client is identified. Further responses to it are sent only when the graph shows that they
-    can arrive, so that one client stops the process only once.
+    can arrive, so that one client stops the process only once, or a few times at growing intervals
+    if it is visible and still not matched.
     """
 
     def __init__(self, node: Node, service: Service, qos: QoSProfile) -> None:
@@ -184,7 +186,8 @@ class Responder:
             for oldest in tuple(self._unreached)[:-MOST_UNREACHED]:
                 self._unreached.pop(oldest, None)
         else:
-            known.given_up = True
+            known.failures += 1
+            known.due = None
         self._graph.refresh(now)
         self._check_qos(guid)
         raise Unmatched(reason)
@@ -227,11 +230,11 @@ class Responder:
         known = self._unreached.get(guid)
         if known is None:
             return
-        if known.given_up:
+        if known.failures == len(MATCH_DELAYS):
             raise Undeliverable("the client is visible, but the middleware does not match it")
-        if known.visible_since is None:
-            known.visible_since = now
-        if now - known.visible_since < MATCH_DELAY:
+        if known.due is None:
+            known.due = now + MATCH_DELAYS[known.failures]
+        if now < known.due:
             raise Unmatched("the client was discovered just now")
 
     def _check_qos(self, guid: bytes) -> None:
