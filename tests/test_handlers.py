@@ -86,7 +86,7 @@ class TestForms:
             lambda *, call: None,
             lambda *calls: None,
         ],
-        ids=repr,
+        ids=["int", "str", "class", "none", "three", "keyword", "variadic"],
     )
     async def test_bad_handlers(self, session: Session, handler: Any) -> None:
         before = len(list(session.node.services))
