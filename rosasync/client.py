@@ -290,6 +290,7 @@ class Client:
         if self.closed or self._loop.is_closed():
             return
         if sequence_number < self.answered or (servers and self.servers and self.servers - servers):
+            self._abandoned.pop(sequence_number, None)
             self.leave(sequence_number)
             return
         self._watch_silence()
@@ -363,18 +364,16 @@ class Client:
             self.answered = sequence_number
         if sequence_number == self._timed:
             self._response_times.add(self._loop.time() - self._timed_at)
+        if call is None or call.future.done():
+            self.counts.late += 1
+        else:
+            call.future.set_result(response)
+        if call is not None:
+            call.end()
+        elif (timer := self._superseded.pop(sequence_number, None)) is not None:
+            timer.cancel()
         if self._abandoned or self._retried:
             self._note_answer(sequence_number)
-        if call is not None:
-            if call.future.done():
-                self.counts.late += 1
-            else:
-                call.future.set_result(response)
-            call.end()
-            return
-        self.counts.late += 1
-        if (timer := self._superseded.pop(sequence_number, None)) is not None:
-            timer.cancel()
 
     def _note_answer(self, sequence_number: int) -> None:
         """Free the places of the requests up to this one, and report it to the retried calls."""

@@ -32,14 +32,15 @@ class RetryBudget:
 
     Args:
         counts: counts the calls that were sent.
+        clock: returns the time in seconds.
     """
 
-    def __init__(self, counts: Counts) -> None:
-        self._loop = asyncio.get_running_loop()
+    def __init__(self, counts: Counts, clock: Callable[[], float]) -> None:
         self._counts = counts
+        self._clock = clock
         self._tokens = PER_SECOND
         # The time, and the number of calls, up to which tokens were added.
-        self._time = self._loop.time()
+        self._time = clock()
         self._calls = counts.sent
 
     def take(self, share: float) -> bool:
@@ -50,7 +51,7 @@ class RetryBudget:
         """
         if share == math.inf:
             return True
-        now, calls = self._loop.time(), self._counts.sent
+        now, calls = self._clock(), self._counts.sent
         earned = (now - self._time) * PER_SECOND + (calls - self._calls) * share
         self._time, self._calls = now, calls
         self._tokens = min(SAVED, self._tokens + earned)

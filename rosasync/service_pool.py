@@ -67,7 +67,7 @@ class ServicePool:
         self._errors = CallErrors(service, node)
         self._clients = ClientSet(service, node, limits, watch, self._errors, self)
         self._counts = self._clients.counts
-        self._budget = RetryBudget(self._counts)
+        self._budget = RetryBudget(self._counts, self._loop.time)
         self._queue: OrderedDict[asyncio.Future[Any], OnClient] = OrderedDict()
         # Each caller who waits for a match, with the client to be matched: None for any client.
         self._ready_waiters: dict[asyncio.Future[None], Client | None] = {}

@@ -27,7 +27,7 @@ class ClientUnderTest:
         self.capacity = 0
         self.callers = False
         self.client = Client(self._open, Limits(**limits), self.counts, self)
-        self.budget = RetryBudget(self.counts)
+        self.budget = RetryBudget(self.counts, asyncio.get_running_loop().time)
         self._deadlines = Deadlines()
 
     def _open(self, deliver: Callable[[int, Any], None]) -> FakeClient:
