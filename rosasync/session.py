@@ -6,7 +6,7 @@ import asyncio
 import importlib
 from collections.abc import Callable, Mapping
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Generic, Literal, Self, overload
+from typing import TYPE_CHECKING, Any, Generic, Literal, NoReturn, Self, overload
 
 from rosasync.aio import start_task
 from rosasync.core import Core, session_closed
@@ -114,6 +114,17 @@ class Session:
             raise UsageError("a session can be opened only once: create a new one")
         self._core = Core(self, self._options, self._open_node)
         return self
+
+    def __enter__(self) -> NoReturn:
+        """Raise `UsageError`: a session needs ``async with``."""
+        raise UsageError(
+            "a session is opened with `async with`, not `with`: "
+            "`async with rosasync.Session(…) as session:`"
+        )
+
+    def __exit__(self, *exc: object) -> None:
+        # `with` looks it up before it calls `__enter__`.
+        raise AssertionError("never entered")
 
     async def __aexit__(
         self,
@@ -345,7 +356,7 @@ class Session:
         Args:
             srv_type: a service class or its name.
             srv_name: the service's name.
-            timeout: seconds, None for no deadline, ``...`` for the session's.
+            timeout: seconds; None, or left out, for no deadline; ``...`` for the session's.
             qos: as for `call`.
 
         Raises:
