@@ -198,7 +198,7 @@ def _lifecycle_node(name: str, reentrant: bool = False, **callbacks: Callable[[A
 
         def __init__(self) -> None:
             Node.__init__(self, name, namespace="/stock")
-            vars(self).update(callbacks)
+            self.__dict__.update(callbacks)
             group = ReentrantCallbackGroup() if reentrant else None
             LifecycleNodeMixin.__init__(self, callback_group=group)
 
