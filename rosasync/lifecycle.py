@@ -15,11 +15,11 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
-from rosasync.errors import CallError, ResponseTimeout, RosasyncError
-from rosasync.typing import Timeout
+from rosasync import CallError, ResponseTimeout, RosasyncError
 
 if TYPE_CHECKING:
-    from rosasync.session import Session
+    from rosasync import Session
+    from rosasync.typing import Timeout
 
 __all__ = [
     "LifecycleClient",

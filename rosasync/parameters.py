@@ -37,12 +37,11 @@ from typing import TYPE_CHECKING, Any, TypeAlias, overload
 
 import anyio
 
-from rosasync.errors import RosasyncError
-from rosasync.ros.messages import to_dict
-from rosasync.typing import Timeout
+from rosasync import RosasyncError, to_dict
 
 if TYPE_CHECKING:
-    from rosasync.session import Session
+    from rosasync import Session
+    from rosasync.typing import Timeout
 
 __all__ = [
     "ParameterClient",

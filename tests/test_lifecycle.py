@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 import rosasync
-from rosasync import ServiceCall, Session
+from rosasync import ServiceCall, ServiceServer, Session
 from rosasync.lifecycle import (
     LifecycleClient,
     LifecycleState,
@@ -156,6 +156,29 @@ class TestTimeouts:
             assert await LifecycleClient(session, "/stuck").configure(timeout=AWHILE) == "inactive"
 
 
+@pytest.mark.parametrize(
+    ("label", "state", "number"),
+    [("activate", 2, 3), ("shutdown", 1, 5), ("shutdown", 2, 6), ("shutdown", 3, 7)],
+)
+async def test_number_and_label_name_the_same_transition(
+    session: Session, label: str, state: int, number: int
+) -> None:
+    """Stock nodes read the label, micro-ROS reads the number."""
+    asked: list[tuple[int, str]] = []
+
+    def change(request: Any, response: Any) -> Any:
+        asked.append((request.transition.id, request.transition.label))
+        response.success = True
+        return response
+
+    async with (
+        session.serve(CHANGE, "/tiny/change_state", change),
+        telling(session, "/tiny", state),
+    ):
+        await getattr(LifecycleClient(session, "/tiny"), label)()
+    assert asked == [(number, label)]
+
+
 async def test_a_node_without_a_lifecycle(session: Session, nodes: NodesProcess) -> None:
     node = LifecycleClient(session, await nodes.add("no_services"), timeout=SOON)
     for ask in (node.state, node.transitions, node.configure, node.shutdown):
@@ -192,18 +215,23 @@ def in_flight(session: Session, name: str) -> bool:
     return any(key.srv_name == name and one.in_flight for key, one in keys.items())
 
 
-@asynccontextmanager
-async def never_changing(session: Session, state: int) -> AsyncIterator[None]:
-    """Serve a node that never answers to a transition, and says that it is in this state."""
-    calls: list[ServiceCall[Any, Any]] = []
+def telling(session: Session, name: str, state: int) -> ServiceServer[Any, Any]:
+    """Serve the state of a node."""
 
     def read(request: Any, response: Any) -> Any:
         response.current_state.id = state
         return response
 
+    return session.serve(STATE, f"{name}/get_state", read)
+
+
+@asynccontextmanager
+async def never_changing(session: Session, state: int) -> AsyncIterator[None]:
+    """Serve a node that never answers to a transition, and says that it is in this state."""
+    calls: list[ServiceCall[Any, Any]] = []
     async with (
         session.serve(CHANGE, "/stuck/change_state", calls.append),
-        session.serve(STATE, "/stuck/get_state", read),
+        telling(session, "/stuck", state),
     ):
         await session.wait_for_service(CHANGE, "/stuck/change_state", timeout=LIMIT)
         yield
