@@ -260,8 +260,8 @@ class ParameterClient:
         Raises:
             ParameterError: a parameter is not declared.
         """
-        found = await self._ask_all("GetParameterTypes", "types", names, timeout)
-        return _one_or_all(names, {name: ParameterType(one) for name, one in found.items()})
+        wanted = _all_of(names)
+        return _one_or_all(names, self._known(wanted, await self._types(wanted, timeout)))
 
     async def list(self, *prefixes: str, depth: int = 0, timeout: Timeout = ...) -> Names:
         """Return the sorted names of the node's parameters.
@@ -395,12 +395,25 @@ class ParameterClient:
         self, service: str, field: str, names: str | Several, timeout: Timeout
     ) -> dict[str, Any]:
         """As `_ask`, but all the names must be known."""
-        wanted = [names] if isinstance(names, str) else [*names]
-        found = await self._ask(service, field, wanted, timeout)
-        missing = [name for name in wanted if name not in found]
+        wanted = _all_of(names)
+        return self._known(wanted, await self._ask(service, field, wanted, timeout))
+
+    def _known(self, names: Iterable[str], found: dict[str, Any]) -> dict[str, Any]:
+        missing = [name for name in names if name not in found]
         if missing:
             raise self._error(dict.fromkeys(missing, NOT_DECLARED))
         return found
+
+    async def _types(self, names: Sequence[str], timeout: Timeout) -> dict[str, ParameterType]:
+        """Return the types of those that are declared."""
+        if not names:
+            return {}
+        # An rclpy node that allows undeclared parameters raises an exception, and ends, if it is
+        # asked for the type of one.
+        declared = {*await self.list(*names, timeout=timeout)}
+        known = [name for name in names if name in declared]
+        found = await self._ask("GetParameterTypes", "types", known, timeout)
+        return {name: ParameterType(number) for name, number in found.items()}
 
     async def _ask(
         self, service: str, field: str, names: Sequence[str], timeout: Timeout
@@ -422,9 +435,9 @@ class ParameterClient:
         """Return the request that sets these values."""
         typed = {name: _typed(name, value) for name, value in values.items()}
         empty = [name for name, (kind, _) in typed.items() if kind is None]
-        kinds = await self._ask("GetParameterTypes", "types", empty, timeout)
+        kinds = await self._types(empty, timeout)
         for name in empty:
-            typed[name] = self._array_type(name, kinds.get(name, 0)), typed[name][1]
+            typed[name] = self._array_type(name, kinds.get(name)), typed[name][1]
         return {
             "parameters": [
                 {"name": name, "value": _to_ros(kind, value)}
@@ -432,9 +445,8 @@ class ParameterClient:
             ]
         }
 
-    def _array_type(self, name: str, number: int) -> ParameterType:
-        kind = ParameterType(number)
-        if kind.is_array:
+    def _array_type(self, name: str, kind: ParameterType | None) -> ParameterType:
+        if kind is not None and kind.is_array:
             return kind
         raise TypeError(
             f"{name!r}: the type of an empty list is unknown, because {self._node_name} has no "
@@ -455,6 +467,10 @@ class ParameterClient:
         return ParameterError(
             f"{self._node_name}: {details}", node_name=self._node_name, reasons=reasons
         )
+
+
+def _all_of(names: str | Several) -> list[str]:
+    return [names] if isinstance(names, str) else [*names]
 
 
 def _one_or_all(names: str | Several, found: dict[str, Any]) -> Any:

@@ -189,7 +189,15 @@ class TestSetting:
     ) -> None:
         node = ParameterClient(session, await nodes.add("undeclared"))
         await node.set({"a.b": 1, "c": ["x"]})
-        assert await node.get(["a.b", "c"]) == {"a.b": 1, "c": ["x"]}
+        assert await node.get(["a.b", "c", "d"]) == {"a.b": 1, "c": ["x"], "d": None}
+        await node.set("c", [])
+        assert await node.types("c") is ParameterType.STRING_ARRAY
+        with pytest.raises(ParameterError, match="'d': it is not declared"):
+            await node.types(["c", "d"])
+        with pytest.raises(TypeError, match="'d': the type of an empty list is unknown"):
+            await node.set("d", [])
+        # The node has survived the questions.
+        assert await node.get("a.b") == 1
 
     @pytest.mark.parametrize(
         ("value", "message"),
