@@ -12,6 +12,7 @@ from rosasync.aio import start_task
 from rosasync.core import Core, session_closed
 from rosasync.errors import UsageError
 from rosasync.options import Limits, Retry, SessionOptions, check_timeout
+from rosasync.ros.middleware import check_middleware
 from rosasync.statistics import SessionStatistics
 from rosasync.typing import RequestT, ResponseT, ServiceType, Timeout
 
@@ -104,7 +105,8 @@ class Session:
         """Open the session in the running loop.
 
         Raises:
-            ImportError: rclpy is not installed; the message says how to install it.
+            ImportError: rclpy is not installed, or the middleware that ``RMW_IMPLEMENTATION``
+                names; the message says what to do.
             UsageError: the session was opened before, or the bridge asked for does not work here.
             TypeError: ``node`` is neither a name nor an rclpy node.
             ValueError: ROS does not allow the node's name.
@@ -577,8 +579,10 @@ def _import_ros(module: str) -> Any:
     """Import a module that needs rclpy.
 
     Raises:
-        ImportError: rclpy is not installed; the message says how to install it.
+        ImportError: rclpy is not installed, or the middleware that the environment names; the
+            message says what to do.
     """
+    check_middleware()
     try:
         return importlib.import_module(module)
     except ImportError as error:
