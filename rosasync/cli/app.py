@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
+from rosasync.cli import lifecycle, param
 from rosasync.cli.bench import bench
 from rosasync.cli.call import call
 from rosasync.cli.demo import demo
@@ -49,6 +50,8 @@ app.command()(ping)
 app.command()(why)
 app.command()(doctor)
 app.command()(demo)
+app.add_typer(param.app, name="param")
+app.add_typer(lifecycle.app, name="lifecycle")
 
 
 def main() -> int:
