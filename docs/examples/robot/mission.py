@@ -3,20 +3,19 @@
 from typing import Any
 
 from py_trees.behaviour import Behaviour
-from py_trees.common import ParallelPolicy, Status
+from py_trees.common import ParallelPolicy
 from py_trees.composites import Parallel, Selector, Sequence
 from std_srvs.srv import SetBool, Trigger
 
 from rosasync.behaviours import CallService, WaitForService
 
 
-def judge(response: Any) -> Status:
+def show(response: Any) -> None:
     print(response.message)
-    return Status.SUCCESS if response.success else Status.FAILURE
 
 
 def call(srv_type: Any, srv_name: str, **fields: Any) -> Behaviour:
-    return CallService(srv_name, srv_type, srv_name, fields, on_response=judge, timeout=5.0)
+    return CallService(srv_name, srv_type, srv_name, fields, on_response=show, timeout=5.0)
 
 
 def make_mission() -> Behaviour:
