@@ -26,6 +26,7 @@ __all__ = [
     "missing_heartbeats",
     "profile_text",
     "profile_variable",
+    "switched_off",
     "user_profile",
 ]
 
@@ -65,6 +66,11 @@ def is_old() -> bool:
         return int(version("rclpy").split(".")[0]) < 8
     except PackageNotFoundError:
         return os.environ.get("ROS_DISTRO", "") in ("humble", "iron", "jazzy")
+
+
+def switched_off() -> bool:
+    """Return whether the user switched off what rosasync sets in the middleware."""
+    return os.environ.get(SWITCH, "").lower() == "off"
 
 
 def profile_variable(old: bool) -> str:
@@ -132,7 +138,7 @@ def applied() -> Iterator[None]:
     the user has a profile or switched this one off.
     """
     old = is_old()
-    if os.environ.get(SWITCH, "").lower() == "off":
+    if switched_off():
         yield
     elif file := user_profile(old):
         _report_missing(file)

@@ -22,7 +22,7 @@ from rosasync.errors import RosasyncError, UsageError
 from rosasync.gateway import LoopGateway
 from rosasync.options import SessionOptions
 from rosasync.ports import ClientPort, Deliver, DeliverRequest, Service, ServicePort
-from rosasync.ros import names, rcl
+from rosasync.ros import discovery, names, rcl
 from rosasync.ros.direct_bridge import DirectBridge
 from rosasync.ros.executor_bridge import ExecutorBridge
 from rosasync.ros.executor_thread import ExecutorThread, ThreadUser, executor_thread_of
@@ -242,9 +242,15 @@ class RosNode:
         """Make a context and its node, with rosasync's profile if the middleware reads it now."""
         self._own_context = Context()
         rclpy.init(context=self._own_context, signal_handler_options=SignalHandlerOptions.NO)
-        with profile.applied():
-            # The first node of a context makes its participant.
+        # The first node of a context makes its participant.
+        with profile.applied(), self._introduced(self._own_context):
             return Node(name, context=self._own_context)
+
+    def _introduced(self, context: Context) -> contextlib.AbstractContextManager[None]:
+        fast_dds = "fastrtps" in rclpy.get_rmw_implementation_identifier()
+        if not fast_dds or profile.switched_off():
+            return contextlib.nullcontext()
+        return discovery.introduced(context.get_domain_id())
 
     def _make_bridge(self, options: SessionOptions, librcl: rcl.Rcl | None) -> Bridge:
         tried = rclpy.get_rmw_implementation_identifier() in DIRECT_TRIED
