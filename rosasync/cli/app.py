@@ -17,6 +17,7 @@ from rosasync.cli.doctor import doctor
 from rosasync.cli.errors import Code, join
 from rosasync.cli.listing import find, info, list_services, nodes, type_of
 from rosasync.cli.ping import ping
+from rosasync.cli.profile import profile
 from rosasync.cli.run import fail, silence_stdout
 from rosasync.cli.serve import serve
 from rosasync.cli.show import show
@@ -49,6 +50,7 @@ app.command()(bench)
 app.command()(ping)
 app.command()(why)
 app.command()(doctor)
+app.command()(profile)
 app.command()(demo)
 app.add_typer(param.app, name="param")
 app.add_typer(lifecycle.app, name="lifecycle")
