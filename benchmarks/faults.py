@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from benchmarks.contestants.base import ANSWERED, LoggedCall
+from benchmarks.link import lossy_hosts
 from benchmarks.pages import markdown_table
 from benchmarks.pipes import Child
 from benchmarks.sharing import older
@@ -32,6 +33,7 @@ __all__ = [
 ]
 
 COMMAND = "faults"
+LOST_SHARE = 0.2
 LOSS, DELAY = "20 % loss", "20 % loss, 100 ms"
 KILLED, RESTARTED, SLOW = "server killed", "server restarted", "slow server"
 STOCK, OURS, RETRY = "call-async", "direct", "direct-retry"
@@ -154,6 +156,20 @@ def measure(
     return faults
 
 
+def _lossy(situation: str, delay: float) -> Callable[[Bench, str, float], Fault]:
+    """Return the measurement of calls over a lossy link."""
+
+    def measure_loss(bench: Bench, contestant: str, seconds: float) -> Fault:
+        with lossy_hosts(LOST_SHARE, delay) as hosts:
+            far = Bench(bench.older, hosts.on_client, hosts.on_server, hosts.environment)
+            work = far.work(TIMEOUT)
+            with far.server(work), far.client(contestant, work) as client:
+                calls = _log(client, CALLERS, seconds)
+        return Fault(situation, contestant, CALLERS, seconds, _ends(calls))
+
+    return measure_loss
+
+
 def _killed(bench: Bench, contestant: str, seconds: float) -> Fault:
     """Kill the server with calls out; a new one starts a second later."""
     work = bench.work(TIMEOUT)
@@ -259,6 +275,8 @@ def _ends(calls: Iterable[LoggedCall]) -> dict[str, int]:
 
 
 SITUATIONS: Mapping[str, Callable[[Bench, str, float], Fault]] = {
+    LOSS: _lossy(LOSS, 0.0),
+    DELAY: _lossy(DELAY, 0.1),
     KILLED: _killed,
     RESTARTED: _restarted,
     SLOW: _slow,
