@@ -34,7 +34,7 @@ __all__ = [
 
 COMMAND = "faults"
 LOST_SHARE = 0.2
-LOSS, DELAY = "20 % loss", "20 % loss, 100 ms"
+LOSS, DELAY = "20 % loss", "20 % loss and 100 ms"
 KILLED, RESTARTED, SLOW = "server killed", "server restarted", "slow server"
 STOCK, OURS, RETRY = "call-async", "direct", "direct-retry"
 BEFORE, BEFORE_RETRY = "before", "before-retry"
