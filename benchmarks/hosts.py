@@ -24,19 +24,13 @@ class NoHosts(Exception):
 class Hosts:
     """A host for the server and one for the contestants.
 
-    Args:
-        cards: two network cards that are linked already, one for each host. By default the hosts
-            are joined by a virtual cable.
-
     Raises:
         NoHosts: on entering, if iproute2 is missing or must not be used.
     """
 
     environment = ENVIRONMENT
 
-    def __init__(self, cards: tuple[str, str] | None = None) -> None:
-        self.cards = cards or ("eth0", "eth0")
-        self._linked = cards is not None
+    def __init__(self) -> None:
         self._names = [f"rosasync-{os.getpid()}-{side}" for side in ("server", "client")]
         self._stack = ExitStack()
 
@@ -49,12 +43,14 @@ class Hosts:
             for name in self._names:
                 _ip("netns", "add", name)
                 self._stack.callback(_ip, "netns", "delete", name)
-            self._join()
-            for number, (name, card) in enumerate(zip(self._names, self.cards, strict=True), 1):
-                _ip("-n", name, "address", "add", f"10.0.0.{number}/24", "dev", card)
-                for link in ("lo", card):
+            server, client = self._names
+            cable = ["type", "veth", "peer", "name", "eth0", "netns", client]
+            _ip("link", "add", "eth0", "netns", server, *cable)
+            for number, name in enumerate(self._names, 1):
+                _ip("-n", name, "address", "add", f"10.0.0.{number}/24", "dev", "eth0")
+                for link in ("lo", "eth0"):
                     _ip("-n", name, "link", "set", link, "up")
-                _ip("-n", name, "route", "add", "224.0.0.0/4", "dev", card)
+                _ip("-n", name, "route", "add", "224.0.0.0/4", "dev", "eth0")
             self._stack = self._stack.pop_all()
         return self
 
@@ -65,15 +61,6 @@ class Hosts:
         tb: TracebackType | None,
     ) -> None:
         self._stack.close()
-
-    def _join(self) -> None:
-        if self._linked:
-            for name, card in zip(self._names, self.cards, strict=True):
-                _ip("link", "set", card, "netns", name)
-            return
-        server, client = self._names
-        cable = ["type", "veth", "peer", "name", "eth0", "netns", client]
-        _ip("link", "add", "eth0", "netns", server, *cable)
 
     @property
     def on_server(self) -> list[str]:
