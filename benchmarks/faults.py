@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from benchmarks.contestants.base import ANSWERED, LoggedCall
-from benchmarks.link import lossy_hosts
+from benchmarks.lossy import LossyHosts
 from benchmarks.pages import markdown_table
 from benchmarks.pipes import Child
 from benchmarks.sharing import older
@@ -33,7 +33,7 @@ __all__ = [
 ]
 
 COMMAND = "faults"
-LOST_SHARE = 0.2
+LOST_SHARE, SEED = 0.2, 1
 LOSS, DELAY = "20 % loss", "20 % loss and 100 ms"
 KILLED, RESTARTED, SLOW = "server killed", "server restarted", "slow server"
 STOCK, OURS, RETRY = "call-async", "direct", "direct-retry"
@@ -160,8 +160,8 @@ def _lossy(situation: str, delay: float) -> Callable[[Bench, str, float], Fault]
     """Return the measurement of calls over a lossy link."""
 
     def measure_loss(bench: Bench, contestant: str, seconds: float) -> Fault:
-        with lossy_hosts(LOST_SHARE, delay) as hosts:
-            far = Bench(bench.older, hosts.on_client, hosts.on_server, hosts.environment)
+        with LossyHosts("server", "client", loss=LOST_SHARE, delay=delay, seed=SEED) as hosts:
+            far = Bench(bench.older, hosts.on("client"), hosts.on("server"), hosts.environment)
             work = far.work(TIMEOUT)
             with far.server(work), far.client(contestant, work) as client:
                 calls = _log(client, CALLERS, seconds)

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import socket
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from benchmarks import cold, commands, faults, hosts, link, pages, profile, sharing
+from benchmarks import cold, commands, faults, hosts, pages, profile, sharing
 from benchmarks.contestants import CONTESTANTS, make_contestant
 from benchmarks.contestants.base import LoggedCall
 from benchmarks.meter import Usage
@@ -26,7 +23,6 @@ from benchmarks.suites import SUITES, make_suite
 from benchmarks.tables import rows
 from benchmarks.targets import PEERS, TARGETS, judge
 from benchmarks.trials import Trials
-from tests.support.times import LIMIT, TICK
 
 MACHINE = {"cpu": "a CPU", "cores": 2, "load": 0.0, "kernel": "6", "python": "3", "middleware": "m"}
 SETTINGS = {"rounds": 2, "quick": True, "pin": False}
@@ -273,27 +269,6 @@ def test_a_report_keeps_the_marked_sections(tmp_path: Path) -> None:
     write_report(results_of(suites()["one at a time"], {"direct": [5]}), tmp_path)
     assert page.read_text().endswith("<!-- cold -->\nkept\n<!-- /cold -->\n")
     assert "former" not in page.read_text()
-
-
-@pytest.mark.parametrize(("loss", "least", "most"), [(0.0, 100, 100), (0.2, 60, 95), (1.0, 0, 0)])
-def test_a_link_loses_packets(loss: float, least: int, most: int) -> None:
-    left, right, stop = (socket.socketpair(type=socket.SOCK_SEQPACKET) for _ in range(3))
-    with ThreadPoolExecutor(1) as thread, ExitStack() as stack:
-        for end in (*left, *right, *stop):
-            stack.enter_context(end)
-        ends = (left[1].fileno(), right[1].fileno())
-        relaying = thread.submit(link.relay, ends, loss, TICK / 50, stop[1].fileno())
-        for number in range(100):
-            left[0].send(bytes([number]))
-        right[0].settimeout(10 * TICK)
-        received: list[int] = []
-        with suppress(TimeoutError):
-            while len(received) < 100:
-                received.append(right[0].recv(10)[0])
-        stop[0].close()
-        relaying.result(LIMIT)
-    assert least <= len(received) <= most
-    assert received == sorted(received)
 
 
 SMALL_RUNS = {
