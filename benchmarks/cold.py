@@ -21,7 +21,6 @@ __all__ = ["PROGRAMS", "Start", "check_programs", "draw", "heading", "measure", 
 
 COMMAND = "cold"
 NAME, TYPE = "/bench/cold", "std_srvs/srv/Empty"
-TIMEOUT = 30.0
 
 STOCK = """\
 import rclpy
@@ -92,16 +91,16 @@ def measure(
 
 
 def _run(command: Sequence[str]) -> float | None:
-    """Run a process to its end; return the seconds until its first output."""
+    """Run a process to its end; return the seconds until its first output, None if it failed."""
     begin = time.monotonic()
     with subprocess.Popen(
         command, cwd=ROOT, env=os.environ, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
     ) as process:
         assert process.stdout is not None
-        answered = bool(process.stdout.readline())
+        process.stdout.readline()
         seconds = time.monotonic() - begin
         process.stdout.read()
-    return seconds if answered and process.returncode == 0 else None
+    return seconds if process.returncode == 0 else None
 
 
 heading = ["", "processes", "p50 s", "p95 s", "longest s", "no answer"]
