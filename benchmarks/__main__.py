@@ -11,16 +11,16 @@ from rich.console import Console
 from rich.progress import Progress
 
 from benchmarks.allocations import measure_allocations, show_allocations
+from benchmarks.commands import add_commands
 from benchmarks.machine import describe_machine
 from benchmarks.results import Results
 from benchmarks.runner import Runner
 from benchmarks.suites import SUITES, make_suite
-from benchmarks.tables import scenario_table, target_table
+from benchmarks.tables import make_console, scenario_table, target_table
 from rosasync.ros.domain import isolate
 
 ROUNDS, QUICK_ROUNDS, ALLOCATION_ROUNDS = 9, 5, 3
 PINNED_CORES = 4
-WIDTH = 180
 
 Quick = Annotated[bool, typer.Option("--quick", help="Fewer calls and rounds.")]
 Rounds = Annotated[int | None, typer.Option(min=1, help=f"{ROUNDS}, or {QUICK_ROUNDS} if quick.")]
@@ -82,6 +82,9 @@ add_command(
     [name for name in SUITES if name != "targets"],
     and_allocations=True,
 )
+
+
+add_commands(app)
 
 
 @app.command()
@@ -180,12 +183,6 @@ def finish(results: Results, json: Path | None) -> None:
     show(make_console(), results)
     if json:
         results.save(json)
-
-
-def make_console() -> Console:
-    """Return a console for the terminal, or one that is wide enough for a table."""
-    console = Console()
-    return console if console.is_terminal else Console(width=WIDTH)
 
 
 def show(console: Console, results: Results) -> None:

@@ -19,6 +19,7 @@ from rich.box import SIMPLE
 from rich.table import Table
 
 import rosasync
+from benchmarks.pages import replace_section
 from benchmarks.pipes import Child
 from benchmarks.work import CALL_TIMEOUT, READY_TIMEOUT, Work, load_type, make_request
 
@@ -26,8 +27,6 @@ __all__ = ["STAGES", "Profile", "Stage", "profile", "table", "updated"]
 
 T = TypeVar("T")
 Args = TypeVarTuple("Args")
-
-BEGIN, END = "<!-- profile -->", "<!-- /profile -->"
 
 PATIENCE = 10.0
 WARM_UP = 500
@@ -121,16 +120,12 @@ def updated(page: str, found: Profile, machine: dict[str, Any]) -> str:
     Raises:
         ValueError: the page does not have the marks.
     """
-    before, begin, rest = page.partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not end:
-        raise ValueError(f"the page has no {BEGIN} … {END}")
     rows = "\n".join(f"| {s.what} | {s.whose} | {us:.1f} |" for s, us in found.stages.items())
     where = f"{machine['cpu']}, {machine['cores']} cores, Python {machine['python']}"
-    return (
-        f"{before}{begin}\n| what happens | whose time | µs |\n|---|---|---:|\n{rows}\n\n"
-        f"{found.summary} {where}.\n{end}{after}"
+    text = (
+        f"| what happens | whose time | µs |\n|---|---|---:|\n{rows}\n\n{found.summary} {where}.\n"
     )
+    return replace_section(page, "profile", text)
 
 
 class Stamps:

@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from benchmarks.allocations import allocation_rows
 from benchmarks.contestants import CONTESTANTS
 from benchmarks.figures import METRICS
+from benchmarks.pages import markdown_table, marked_sections
 from benchmarks.results import Results, Turn
 from benchmarks.tables import describe, rows
 from benchmarks.targets import judge
@@ -52,12 +53,13 @@ def write_report(results: Results, out: Path) -> Path:
         if not results.contestants(scenario):
             continue
         heading, body = rows(results, scenario)
-        sections += [f"## {_title(scenario)}\n\n{_sentence(what)}\n", _markdown(heading, body)]
+        sections += [f"## {_title(scenario)}\n\n{_sentence(what)}\n", markdown_table(heading, body)]
         if scenario in plots:
             picture = plots[scenario].relative_to(out)
             sections.append(f"![{scenario}]({picture})\n")
     for part in results.allocations[0] if results.allocations else ():
-        sections += [f"## Allocations: {part}\n", _markdown(*allocation_rows(results, part))]
+        sections += [f"## Allocations: {part}\n", markdown_table(*allocation_rows(results, part))]
+    sections += marked_sections(page.read_text()) if page.exists() else []
     page.write_text("\n".join(sections))
     return page
 
@@ -184,7 +186,7 @@ def _machine(results: Results) -> Iterator[str]:
         for key, entry in CONTESTANTS.items()
         if key in used
     ]
-    yield _markdown(["", "", "kind", "keeps a core busy"], body)
+    yield markdown_table(["", "", "kind", "keeps a core busy"], body)
 
 
 def _targets(results: Results) -> Iterator[str]:
@@ -194,13 +196,7 @@ def _targets(results: Results) -> Iterator[str]:
     ]
     if body:
         yield "## Targets\n"
-        yield _markdown(["", "target", "outcome"], body)
-
-
-def _markdown(heading: list[str], body: list[list[str]]) -> str:
-    lines = [heading, ["---"] * len(heading), *body]
-    cells = ([cell.replace("|", "\\|") for cell in line] for line in lines)
-    return "\n".join(f"| {' | '.join(line)} |" for line in cells) + "\n"
+        yield markdown_table(["", "target", "outcome"], body)
 
 
 def _title(scenario: str) -> str:

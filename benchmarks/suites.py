@@ -16,8 +16,9 @@ from benchmarks.work import Work
 
 __all__ = ["SUITES", "make_suite"]
 
+FOR_FAULTS = ("direct-retry", "call-async", "semaphore")
 ALL = tuple(
-    key for key, entry in CONTESTANTS.items() if key != "direct-retry" and entry.kind != "leaf"
+    key for key, entry in CONTESTANTS.items() if key not in FOR_FAULTS and entry.kind != "leaf"
 )
 MANY_AT_ONCE = tuple(key for key in ALL if key != "process-per-call")
 LEADING = ("direct", "direct-uvloop", "executor", "call", "afor-qos", "floor")

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from rich.box import SIMPLE
+from rich.console import Console
 from rich.table import Table
 
 from benchmarks.figures import METRICS, brief, figure, pooled_percentile, ratio
@@ -15,7 +16,9 @@ from benchmarks.servers import SERVERS
 from benchmarks.targets import judge
 from benchmarks.ticks import describe_ticks
 
-__all__ = ["describe", "rows", "scenario_table", "target_table"]
+__all__ = ["describe", "make_console", "make_table", "rows", "scenario_table", "target_table"]
+
+WIDTH = 180
 
 COLUMNS = {
     "median": ("median", "p99", "p99.9", "rate", "client_cpu", "server_cpu", "switches"),
@@ -78,10 +81,21 @@ def rows(results: Results, scenario: str) -> tuple[list[str], list[list[str]]]:
     return ["", *heading, *baselines.values(), "remarks"], table
 
 
+def make_console() -> Console:
+    """Return a console for the terminal, or one that is wide enough for a table."""
+    console = Console()
+    return console if console.is_terminal else Console(width=WIDTH)
+
+
 def scenario_table(results: Results, scenario: str) -> Table:
     heading, body = rows(results, scenario)
     what = describe(results.scenarios[scenario])
-    table = Table(title=f"[bold]{scenario}[/]: {what}", title_justify="left", box=SIMPLE)
+    return make_table(f"[bold]{scenario}[/]: {what}", heading, body)
+
+
+def make_table(title: str, heading: list[str], body: list[list[str]]) -> Table:
+    """Return a table for the terminal; the first and the last column are words."""
+    table = Table(title=title, title_justify="left", box=SIMPLE)
     for i, column in enumerate(heading):
         words = i in (0, len(heading) - 1)
         table.add_column(column, justify="left" if words else "right", no_wrap=not words or i == 0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import array
 import dataclasses
 import importlib
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -42,7 +43,9 @@ class Work:
             is not the bottleneck; ``inside``, created by the contestant in its own process;
             ``stock-async``, stock with an async handler; ``stopped``, stock, and stopped by its
             first request; or one of `benchmarks.servers`.
+        handling: seconds for which a stock server's callback runs.
         busy: seconds at a time for which the contestant's thread handles no responses.
+        timeout: seconds after which a call counts as lost; only some contestants use it.
         srv_name: the prefix of all service names; each turn has its own.
     """
 
@@ -53,7 +56,9 @@ class Work:
     idle_clients: int = 0
     depth: int | None = None
     server: str = "stock"
+    handling: float = 0.0
     busy: float = 0.0
+    timeout: float = CALL_TIMEOUT
     srv_name: str = "/bench"
 
     @classmethod
@@ -97,7 +102,14 @@ def make_response(work: Work) -> Any:
 def make_handler(work: Work) -> Callable[[Any, Any], Any]:
     """Return a service callback that answers with a prepared response."""
     prepared = make_response(work)
-    return lambda _request, _response: prepared
+    if not work.handling:
+        return lambda _request, _response: prepared
+
+    def handle(_request: Any, _response: Any) -> Any:
+        time.sleep(work.handling)
+        return prepared
+
+    return handle
 
 
 def make_qos(depth: int | None) -> Any:

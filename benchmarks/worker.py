@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, cast
 
 from benchmarks.contestants import Contestant, Tally, make_contestant
-from benchmarks.contestants.base import Soaking
+from benchmarks.contestants.base import Logging, Mixing, Soaking
 from benchmarks.meter import Usage, resident_bytes, usage
 from benchmarks.pipes import answer_lines
 from benchmarks.ticking import Ticking
@@ -32,13 +32,25 @@ class Worker:
         self._contestant.setup(Work.from_json(work))
         return {}
 
-    def do_call(self, callers: int, calls: int, seconds: float) -> dict[str, Any]:
+    def do_call(
+        self, callers: int, calls: int, seconds: float, begin: float | None = None
+    ) -> dict[str, Any]:
+        """Call, from a time on the monotonic clock on if one is given."""
+        if begin is not None:
+            self._contestant.rest(max(0.0, begin - time.monotonic()))
         before = usage()
         if callers == 1:
             tally = self._contestant.one_at_a_time(calls, seconds)
         else:
             tally = self._contestant.at_once(callers, calls, seconds)
         return _result(tally, usage() - before)
+
+    def do_log(self, callers: int, seconds: float) -> dict[str, Any]:
+        """Call, and answer with every single call."""
+        return {"calls": cast(Logging, self._contestant).logged(callers, seconds)}
+
+    def do_beside(self, plain: int, retried: int) -> dict[str, Any]:
+        return {"calls": cast(Mixing, self._contestant).beside(plain, retried)}
 
     def do_rest(self, seconds: float) -> dict[str, Any]:
         """Rest, and measure without the first and the last moments."""

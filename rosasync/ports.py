@@ -122,6 +122,16 @@ class ServicePort(Protocol):
     def has_clients(self) -> bool:
         """Return whether the graph shows a client. From any thread, but not during `close`."""
 
+    def delivered(self) -> bool:
+        """Return whether every client is known to have received every response.
+
+        False also if the middleware cannot tell.
+
+        Raises:
+            PortDestroyed: the service was destroyed.
+            ContextShutdown: the node is down.
+        """
+
     def stop(self) -> None:
         """Stop delivering requests; idempotent. Responses may still be sent."""
 

@@ -7,6 +7,7 @@ import bisect
 import functools
 import itertools
 import logging
+import math
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
@@ -209,7 +210,9 @@ class ServiceServer(Generic[RequestT, ResponseT]):
 
         It stops taking requests, and lets the handlers finish, also those of waiting requests, for
         ``timeout`` seconds (None: without a limit). Then it cancels the rest and destroys the
-        service. Calls that are still unanswered stay unanswered.
+        service. Calls that are still unanswered stay unanswered. If it has responded within the
+        last half second, it first waits that long at most, within the timeout, until the clients
+        have received the responses. Otherwise the middleware would drop them with the service.
 
         A handler may close its server, or its session, itself or in a task that it starts. It is
         then neither waited for nor cancelled, and should have responded before.
@@ -352,6 +355,8 @@ class ServiceServer(Generic[RequestT, ResponseT]):
                     self._name,
                     len(self._tasks),
                 )
+        left = math.inf if deadline is None else deadline - self._loop.time()
+        await self._sender.wait_until_delivered(left)
         await asyncio.sleep(self._port.destroy_delay)
         self.end(functools.partial(SessionClosed, f"{self._name}: the server is closed"))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import threading
 import warnings
 from collections.abc import Callable, Coroutine
@@ -30,6 +31,11 @@ RESEND = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 1.6, 1.6, 1.6, 1.6)
 has not discovered completely."""
 MAX_UNSENT = 1000
 """Maximum number of responses of a server that wait to be sent again."""
+DELIVERY_TIME = 0.5
+"""Maximum number of seconds between a response and the end of its service that it delays. Repairs
+of lost packets take several of the middleware's heartbeats (20 ms, or 3 s by its own default)."""
+DELIVERY_INTERVAL = 0.01
+"""Seconds between two queries whether the last responses were received."""
 LATE = 0.1
 """Seconds after which the graph is checked for a client, because it may have left."""
 
@@ -230,6 +236,7 @@ class ResponseSender(Generic[ResponseT]):
         self._thread = threading.get_ident()
         self._resender = Resender(self, spawn)
         self._on_destroyed = on_destroyed
+        self._last_sent = -math.inf
         self._idle = threading.Condition(self.lock)
         self._sending = 0
 
@@ -323,6 +330,20 @@ class ResponseSender(Generic[ResponseT]):
             return False
         return True
 
+    async def wait_until_delivered(self, timeout: float) -> None:
+        """Wait until the clients have received the last responses, or may be expected to have.
+
+        The middleware drops what is not received yet when its service is destroyed. Responses that
+        are older than `DELIVERY_TIME` are not waited for: their clients may have been killed.
+
+        Args:
+            timeout: maximum number of seconds to wait.
+        """
+        until = min(self._last_sent + DELIVERY_TIME, monotonic() + timeout)
+        with suppress(ContextShutdown, PortDestroyed):
+            while monotonic() < until and self._is_undelivered():  # noqa: ASYNC110
+                await asyncio.sleep(DELIVERY_INTERVAL)
+
     def shut(self, ending: Callable[[], Exception]) -> None:
         """Refuse further responses; the first ``ending`` stays."""
         with self.lock:
@@ -338,6 +359,10 @@ class ResponseSender(Generic[ResponseT]):
         with self.lock:
             self._idle.wait_for(lambda: not self._sending)
             self._counts.dropped += self._counts.unanswered
+
+    def _is_undelivered(self) -> bool:
+        """Return whether a client may not have received the last responses yet."""
+        return self._port.has_clients() and not self._port.delivered()
 
     def _count_dropped(self) -> None:
         with self.lock:
@@ -365,7 +390,9 @@ class ResponseSender(Generic[ResponseT]):
             raise service_destroyed(self.name) from error
         finally:
             with self.lock:
-                self._counts.responded += sent
+                if sent:
+                    self._counts.responded += 1
+                    self._last_sent = monotonic()
                 self._sending -= 1
                 if self.ending is not None:
                     self._idle.notify_all()

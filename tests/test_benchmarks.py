@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from benchmarks import hosts, profile
+from benchmarks import cold, commands, faults, hosts, pages, profile, sharing
 from benchmarks.contestants import CONTESTANTS, make_contestant
+from benchmarks.contestants.base import LoggedCall
 from benchmarks.meter import Usage
+from benchmarks.pipes import ROOT
 from benchmarks.report import write_report
 from benchmarks.results import Results, Turn
 from benchmarks.runner import Scenario
 from benchmarks.suites import SUITES, make_suite
 from benchmarks.tables import rows
 from benchmarks.targets import PEERS, TARGETS, judge
+from benchmarks.trials import Trials
 
 MACHINE = {"cpu": "a CPU", "cores": 2, "load": 0.0, "kernel": "6", "python": "3", "middleware": "m"}
 SETTINGS = {"rounds": 2, "quick": True, "pin": False}
@@ -141,3 +147,153 @@ def test_a_page_is_updated_between_its_marks() -> None:
     assert profile.updated(new, found, MACHINE) == new
     with pytest.raises(ValueError, match="has no"):
         profile.updated("a page", found, MACHINE)
+
+
+def cell(contestant: str, answers: list[int], **options: Any) -> sharing.Cell:
+    """Return a cell of the command `sharing`: by default one of 1 ms of work, and nothing lost."""
+    options = {"work": 1.0, "flooded": False, "seconds": 1.0, "lost": 0, "failed": 0, **options}
+    return sharing.Cell(contestant, len(answers), answers=answers, median=1.0, p99=2.0, **options)
+
+
+def test_jains_index() -> None:
+    assert sharing.jain([7, 7, 7]) == 1.0
+    assert sharing.jain([5, 0, 0, 0]) == 0.25
+    assert sharing.jain([0, 0]) == 0.0
+
+
+def test_the_cells_of_a_command_are_checked(tmp_path: Path) -> None:
+    found = sharing.plans(["direct", "call"], [1, 4], [0.0, 5.0], mixed=True)
+    assert len(found) == 9
+    assert [plan.contestant for plan in found if plan.flooded] == ["direct"]
+    with pytest.raises(ValueError, match="no contestant dirct"):
+        sharing.plans(["dirct"], [1], [1.0], mixed=False)
+    with pytest.raises(ValueError, match="needs --before"):
+        sharing.plans(["before"], [1], [1.0], mixed=False)
+    with pytest.raises(ValueError, match="no negative work"):
+        sharing.plans(["direct"], [0], [1.0], mixed=False)
+    with pytest.raises(ValueError, match="no situation flood"):
+        faults.plans(["flood"], ["direct"])
+    with pytest.raises(ValueError, match="need --before"):
+        faults.plans([faults.SLOW], ["before"])
+    assert faults.plans([faults.SLOW], ["before"], tmp_path) == [(faults.SLOW, "before")]
+    with pytest.raises(ValueError, match="no program stock"):
+        cold.check_programs(["stock"])
+
+
+def test_the_goals_of_sharing() -> None:
+    cells = [
+        cell("direct", [90, 90]),
+        cell("semaphore", [100, 100]),
+        cell("call", [500, 500], lost=1),
+        cell("direct", [100]),
+        cell("before", [200], seconds=2.0),
+        cell("direct-retry", [5] * 16, lost=2),
+    ]
+    outcomes = {goal.name.rpartition(" ")[0]: goal for goal in sharing.goals(cells)}
+    assert [(name.split(",")[0], goal.met, goal.text) for name, goal in outcomes.items()] == [
+        ("calls lost", True, "0"),
+        ("Jain's index", True, "1"),
+        ("answers/s in all", False, "0.9"),
+        ("one process", True, "1"),
+        ("calls lost with Retry", False, "2"),
+        ("calls lost with Retry", None, ""),
+    ]
+
+
+def test_labels_are_spread() -> None:
+    assert sharing.spread([0.5, 0.0, 0.0], 0.1) == pytest.approx([0.5, 0.0, 0.1])
+    assert sharing.spread([0.5, 0.5], 0.1) == pytest.approx([0.45, 0.55])
+    assert sharing.spread([], 0.1) == []
+
+
+def test_unanswered_calls_end_late_after_their_restart() -> None:
+    calls = [
+        LoggedCall(1.0, 2.2, "ServerGone"),  # out at the restart
+        LoggedCall(2.5, 3.0, "ServerGone"),  # begun after it
+        LoggedCall(1.0, 9.0, "ResponseTimeout"),
+        LoggedCall(0.0, 1.0, "ResponseTimeout"),  # before any
+        LoggedCall(1.0, 2.0, "answered"),
+    ]
+    assert faults.late_calls(calls, [2.0, 4.0]) == pytest.approx([0.2, 1.0, 7.0, 1.0])
+
+
+def test_the_goals_of_faults() -> None:
+    found = [
+        faults.Fault(faults.LOSS, "direct", 10, 1.0, {"answered": 30}),
+        faults.Fault(faults.LOSS, "call-async", 10, 1.0, {"answered": 20, "TimeoutError": 3}),
+        faults.Fault(faults.KILLED, "direct", 10, 1.0, {"QueueTimeout": 2}, first_answer=1.5),
+        faults.Fault(faults.RESTARTED, "direct", 50, 1.0, {"ServerGone": 2}, 1, late=0),
+        faults.Fault(faults.SLOW, "direct-retry", 10, 1.0, {"answered": 8}, plain_lost=2),
+    ]
+    met = [goal.met for goal in faults.goals(found)]
+    assert met == [True, None, False, True, None, False]
+    assert "next answer after 1.5 s" in faults.row(found[2])[-1]
+
+
+def test_trials_are_published_between_their_marks(tmp_path: Path) -> None:
+    machine = {**MACHINE, "versions": {"rclpy": "7"}}
+    starts = [cold.Start("rosasync script", 0.5), cold.Start("rosasync script", None)]
+    kinds: list[tuple[str, list[Any]]] = [
+        ("sharing", [cell("direct", [5]), cell("direct", [5, 4])]),
+        ("faults", [faults.Fault(faults.SLOW, "direct", 8, 1.0, {"answered": 24}, plain_lost=0)]),
+        ("cold", starts),
+    ]
+    files = []
+    for command, rows_of in kinds:
+        trials = Trials(command, {"callers": 16, "seconds": 1.0, "processes": 2}, machine)
+        trials.rows = [dataclasses.asdict(row) for row in rows_of]
+        files.append(tmp_path / f"{command}.json")
+        trials.save(files[-1])
+    (again,) = Trials.load(files[-1:] * 2)
+    assert len(again.rows) == 4
+    page = tmp_path / "benchmarks.md"
+    marks = [f"<!-- {command} -->\nformer\n<!-- /{command} -->\n" for command, _ in kinds]
+    page.write_text("".join(("# Title\n", *marks)))
+    commands.publish(files, tmp_path)
+    text = page.read_text()
+    assert "former" not in text
+    assert "| rosasync script | 2 | 0.50 | 0.50 | 0.50 | 1 |" in text
+    assert "| rosasync | 2 | 1 | 0 | 0.00 | 9.00 | 4 | 0.99 | 1.00 | 2.00 |  |" in text
+    assert {path.name for path in (tmp_path / "benchmarks").iterdir()} == {
+        f"{command}.{kind}" for command in ("sharing", "cold") for kind in ("svg", "png")
+    }
+    assert len(pages.marked_sections(text)) == 3
+    page.write_text("{}")
+    with pytest.raises(ValueError, match="not the trials"):
+        Trials.load([page])
+
+
+def test_a_report_keeps_the_marked_sections(tmp_path: Path) -> None:
+    page = tmp_path / "benchmarks.md"
+    page.write_text("former\n<!-- cold -->\nkept\n<!-- /cold -->\n")
+    write_report(results_of(suites()["one at a time"], {"direct": [5]}), tmp_path)
+    assert page.read_text().endswith("<!-- cold -->\nkept\n<!-- /cold -->\n")
+    assert "former" not in page.read_text()
+
+
+SMALL_RUNS = {
+    "sharing": ("--contestants=direct,semaphore", "--processes=2", "--work=1", "--seconds=0.3"),
+    "faults": ("--situations=slow server", "--contestants=direct-retry"),
+    "cold": ("--programs=stock rclpy script,rosasync script", "--processes=1"),
+}
+
+
+@pytest.mark.parametrize("command", SMALL_RUNS)
+def test_a_small_run(command: str, tmp_path: Path) -> None:
+    file = tmp_path / "rows.json"
+    subprocess.run(
+        [sys.executable, "-m", "benchmarks", command, *SMALL_RUNS[command], f"--json={file}"],
+        cwd=ROOT,
+        check=True,
+        stdout=subprocess.DEVNULL,
+    )
+    (trials,) = Trials.load([file])
+    assert trials.command == command
+    if command == "sharing":
+        cells = [sharing.Cell(**row) for row in trials.rows]
+        assert [c.contestant for c in cells] == ["direct", "direct", "semaphore"]
+        assert all(len(c.answers) == 2 and c.total for c in cells)
+    elif command == "faults":
+        assert faults.Fault(**trials.rows[0]).answered
+    else:
+        assert all(row["seconds"] for row in trials.rows)

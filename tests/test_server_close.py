@@ -21,6 +21,7 @@ from rosasync import (
     SessionClosed,
     UsageError,
 )
+from rosasync.ports import PortDestroyed
 from tests.support.echo import ECHO
 from tests.support.serving import (
     AnyCall,
@@ -34,6 +35,7 @@ from tests.support.times import LIMIT, TICK, until
 
 if TYPE_CHECKING:
     from tests.conftest import Bridge
+    from tests.support.clients import ClientProcess
 
 
 class TestClose:
@@ -264,3 +266,74 @@ class TestClose:
             sessions.clear()
         await until(lambda: server.closed)
         assert server.statistics().responded == 1
+
+
+class TestLastResponses:
+    async def test_the_end_waits_until_they_are_received(
+        self, session: Session, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("rosasync.service_call.DELIVERY_TIME", LIMIT)
+        server = session.serve(ECHO, "/served", echo_call)
+        received = asyncio.Event()
+        monkeypatch.setattr(server._port, "delivered", received.is_set)
+        assert await ask(session, "/served", "text") == "text"
+        closing = asyncio.create_task(server.aclose(None))
+        await asyncio.sleep(2 * TICK)
+        assert not closing.done()
+        received.set()
+        await closing
+
+    async def test_the_deadline_ends_the_wait(
+        self, session: Session, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("rosasync.service_call.DELIVERY_TIME", 10 * LIMIT)
+        server = session.serve(ECHO, "/served", echo_call)
+        monkeypatch.setattr(server._port, "delivered", lambda: False)
+        assert await ask(session, "/served", "text") == "text"
+        await asyncio.wait_for(server.aclose(TICK), LIMIT)
+
+    async def test_no_wait_for_old_ones(
+        self, session: Session, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("rosasync.service_call.DELIVERY_TIME", TICK)
+        server = session.serve(ECHO, "/served", echo_call)
+        monkeypatch.setattr(server._port, "delivered", lambda: pytest.fail("asked"))
+        assert await ask(session, "/served", "text") == "text"
+        await asyncio.sleep(2 * TICK)
+        await server.aclose()
+
+    async def test_no_wait_if_no_client_is_left(
+        self, session: Session, bridge: Bridge, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("rosasync.service_call.DELIVERY_TIME", 10 * LIMIT)
+        server = session.serve(ECHO, "/served", echo_call)
+        monkeypatch.setattr(server._port, "delivered", lambda: False)
+        async with Session("leaving", bridge=bridge) as client:
+            assert await ask(client, "/served", "text") == "text"
+        await asyncio.wait_for(server.aclose(None), LIMIT)
+
+    async def test_the_middleware_tells_when_they_are_received(
+        self, session: Session, client_process: ClientProcess
+    ) -> None:
+        server = session.serve(ECHO, "/served", echo_call)
+        await client_process.start("/served", 10)
+        assert (await client_process.result()).answered == 10
+        await until(server._port.delivered)
+
+    async def test_nothing_is_asked_of_a_destroyed_service(self, session: Session) -> None:
+        server = session.serve(ECHO, "/served", echo_call)
+        session.node.destroy_service(server.handle)
+        with pytest.raises(PortDestroyed):
+            server._port.delivered()
+
+    async def test_a_session_that_answers_and_ends(
+        self, bridge: Bridge, client_process: ClientProcess
+    ) -> None:
+        for _ in range(3):
+            async with Session("answering", bridge=bridge) as session:
+                holder = Holder()
+                session.serve(ECHO, "/served", holder)
+                await client_process.start("/served", 1, clients=10)
+                for call in await holder.held(10):
+                    call.respond(echo_of(call.request))
+            assert (await client_process.result()).answered == 10

@@ -44,6 +44,8 @@ CONTESTANTS = {
     "pool": Entry("client.call in a thread pool", "thread_pool"),
     "to-thread": Entry("asyncio.to_thread(client.call)", "to_thread"),
     "polled": Entry("call_async polled with sleep(0)", "polled_future", spins=True),
+    "call-async": Entry("call_async, an asyncio future, no limit", "call_async"),
+    "semaphore": Entry("call_async, a semaphore of ten", "call_async"),
     "spin-task": Entry("spin_once(0) in an asyncio task", "spin_in_task", spins=True),
     "spin-until": Entry("spin_until_future_complete", "spin_until_complete"),
     "afor": Entry("asyncio-for-robotics, its default QoS", "asyncio_for_robotics"),

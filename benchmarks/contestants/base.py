@@ -10,16 +10,20 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from benchmarks.pipes import describe
 from benchmarks.work import READY_TIMEOUT, Work, load_type, make_handler, make_qos
 
 __all__ = [
+    "ANSWERED",
     "BREATH",
     "Asynchronous",
     "Blocking",
     "Contestant",
+    "LoggedCall",
+    "Logging",
+    "Mixing",
     "Soaking",
     "Tally",
     "Windowed",
@@ -30,8 +34,18 @@ __all__ = [
 
 now = time.perf_counter_ns
 
+ANSWERED = "answered"
+
 BREATH = 0.005
 """Seconds for calls between two busy periods."""
+
+
+class LoggedCall(NamedTuple):
+    """One call: its begin and end on the monotonic clock, and ``answered`` or its error's name."""
+
+    begin: float
+    end: float
+    outcome: str
 
 
 @dataclass
@@ -89,6 +103,20 @@ class Soaking(Contestant, Protocol):
 
     def soak(self, calls: int) -> Tally:
         """Make calls: a third is answered, a third times out, and a third is cancelled."""
+
+
+class Logging(Contestant, Protocol):
+    """A contestant that can tell how every call went."""
+
+    def logged(self, callers: int, seconds: float) -> list[LoggedCall]:
+        """Keep calls outstanding as `at_once` does, and return every call that was made."""
+
+
+class Mixing(Contestant, Protocol):
+    """A contestant that can make calls with and without retries in one process."""
+
+    def beside(self, plain: int, retried: int) -> list[tuple[bool, bool]]:
+        """Make calls at once; return for each whether it was retried and whether answered."""
 
 
 class Blocking(ABC):
@@ -206,6 +234,26 @@ class Asynchronous(ABC):
     def close(self) -> None:
         with self.runner:
             self.runner.run(self.shut())
+
+    def logged(self, callers: int, seconds: float) -> list[LoggedCall]:
+        return self.runner.run(self._logged(callers, seconds))
+
+    async def _logged(self, callers: int, seconds: float) -> list[LoggedCall]:
+        log: list[LoggedCall] = []
+        until = time.monotonic() + seconds
+        async with asyncio.TaskGroup() as group:
+            for _ in range(callers):
+                group.create_task(self._log(until, log))
+        return log
+
+    async def _log(self, until: float, log: list[LoggedCall]) -> None:
+        while (begin := time.monotonic()) < until:
+            outcome = ANSWERED
+            try:
+                await self.call(0)
+            except Exception as exc:
+                outcome = type(exc).__name__
+            log.append(LoggedCall(begin, time.monotonic(), outcome))
 
     async def _tasks(self, callers: int, calls: int, seconds: float) -> Tally:
         tally = Tally()

@@ -13,7 +13,6 @@ import uvloop
 import rosasync
 from benchmarks.contestants.base import Asynchronous, Tally
 from benchmarks.work import (
-    CALL_TIMEOUT,
     READY_TIMEOUT,
     Work,
     load_type,
@@ -50,7 +49,7 @@ class Rosasync(Asynchronous):
                 "bench",
                 bridge=self._bridge,
                 limits=self._limits,
-                timeout=CALL_TIMEOUT,
+                timeout=work.timeout,
                 busy_poll=self._busy_poll,
             )
         )
@@ -68,6 +67,21 @@ class Rosasync(Asynchronous):
 
     async def shut(self) -> None:
         await self._stack.aclose()
+
+    def beside(self, plain: int, retried: int) -> list[tuple[bool, bool]]:
+        return self.runner.run(self._beside(plain, retried))
+
+    async def _beside(self, plain: int, retried: int) -> list[tuple[bool, bool]]:
+        kinds = [True] * retried + [False] * plain
+        calls = (
+            self._clients[0].call(self._request, retry=self._retry if kind else None)
+            for kind in kinds
+        )
+        ends = await asyncio.gather(*calls, return_exceptions=True)
+        return [
+            (kind, not isinstance(end, BaseException))
+            for kind, end in zip(kinds, ends, strict=True)
+        ]
 
     def soak(self, calls: int) -> Tally:
         """Make calls: a third is answered, a third times out, and a third is cancelled."""

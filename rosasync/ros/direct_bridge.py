@@ -322,6 +322,7 @@ class DirectService:
         self._responder = Responder(node, service, self.qos)
         self.send = self._responder.send
         self.has_clients = self._responder.has_clients
+        self.delivered = self._responder.delivered
         self._closed = False
         self._stopped = False
         self._signal = signals.join(self)

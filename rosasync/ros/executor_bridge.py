@@ -202,6 +202,7 @@ class ExecutorService:
         self._responder = Responder(node, service, self.qos)
         self.send: Callable[[RequestHeader, Any], None] = self._responder.send
         self.has_clients = self._responder.has_clients
+        self.delivered = self._responder.delivered
         service.send_response = self._taken
 
     @property

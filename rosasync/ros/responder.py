@@ -23,6 +23,7 @@ from rosasync.ros.endpoints import (
     response_readers,
 )
 from rosasync.ros.failures import RclpyError, explain, is_destroyed, uses_node
+from rosasync.ros.fastdds import acknowledged
 
 __all__ = ["Responder", "client_of"]
 
@@ -154,6 +155,19 @@ class Responder:
         """
         with uses_node(self._node), self._node.handle:
             return bool(self._node.handle.get_count_clients(self._srv_name))
+
+    def delivered(self) -> bool:
+        """Return whether every client is known to have received every response.
+
+        Raises:
+            PortDestroyed: the service was destroyed.
+            ContextShutdown: the node is down.
+        """
+        try:
+            with self._handle:
+                return acknowledged(self._handle)
+        except RclpyError as error:
+            raise explain(self._node, self._handle, error) from error
 
     def _failure(self, error: Exception) -> Exception:
         if is_destroyed(self._handle):

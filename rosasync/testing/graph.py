@@ -134,6 +134,10 @@ class FakeService(FakeServer):
                 header.client.later, self.graph.delay, header.sequence_number, copy
             )
 
+    def delivered(self) -> bool:
+        """Return True: a response sent is not lost with its service."""
+        return True
+
     def has_clients(self) -> bool:
         """Return whether there is a client of this name."""
         return any(

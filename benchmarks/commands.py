@@ -1,0 +1,181 @@
+"""The commands about many programs and faults: ``sharing``, ``faults``, ``cold``, ``publish``."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import matplotlib
+import typer
+from matplotlib.figure import Figure
+from rich.progress import Progress
+
+from benchmarks import cold, faults, sharing
+from benchmarks.hosts import NoHosts
+from benchmarks.pages import replace_section
+from benchmarks.tables import make_console, make_table
+from benchmarks.trials import Goal, Trials
+from rosasync.ros.domain import isolate
+
+__all__ = ["add_commands"]
+
+T = TypeVar("T")
+
+Json = Annotated[Path | None, typer.Option("--json", help="Write the rows to this file.")]
+Before = Annotated[
+    Path | None,
+    typer.Option(exists=True, help="A checkout whose rosasync is measured as `before`."),
+]
+Contestants = Annotated[str, typer.Option(help="These contestants: a,b,c.")]
+
+
+def add_commands(app: typer.Typer) -> None:
+    """Add the commands to the command line."""
+    app.command("sharing")(share)
+    app.command("faults")(fail)
+    app.command("cold")(start)
+    app.command("publish")(publish)
+
+
+def share(
+    contestants: Contestants = sharing.USUAL,
+    processes: Annotated[str, typer.Option(help="Numbers of client processes.")] = "1,2,4,8,16",
+    work: Annotated[str, typer.Option(help="The server's work in ms.")] = "0,1,5",
+    callers: Annotated[int, typer.Option(min=1, help="Callers in each process.")] = 16,
+    seconds: Annotated[float, typer.Option(min=0.1, help="Seconds for each cell.")] = 10.0,
+    mixed: Annotated[bool, typer.Option(help="Also measure beside a stock flooder.")] = True,
+    before: Before = None,
+    json: Json = None,
+) -> None:
+    """Several client processes on one stock server: calls lost, fairness and latency."""
+    with checked():
+        chosen = sharing.plans(
+            split(contestants), split(processes, int), split(work, float), mixed, before
+        )
+    isolate()
+    trials = Trials(sharing.COMMAND, {"callers": callers, "seconds": seconds})
+    with collected(trials, sharing.heading, sharing.row, len(chosen), json) as add:
+        cells = sharing.measure(chosen, callers, seconds, before, add)
+    show_goals(sharing.goals(cells))
+
+
+def fail(
+    situations: Annotated[str, typer.Option(help="These situations.")] = (
+        ",".join(faults.SITUATIONS)
+    ),
+    contestants: Contestants = f"{faults.STOCK},{faults.OURS},{faults.RETRY}",
+    seconds: Annotated[float, typer.Option(min=0.1, help="Seconds for each row.")] = 20.0,
+    before: Before = None,
+    json: Json = None,
+) -> None:
+    """Calls while packets are lost, or the server is killed, restarted or slow; may need root."""
+    with checked():
+        chosen = faults.plans(split(situations), split(contestants), before)
+    isolate()
+    trials = Trials(faults.COMMAND, {"seconds": seconds})
+    with collected(trials, faults.heading, faults.row, len(chosen), json) as add:
+        found = faults.measure(chosen, seconds, before, add)
+    show_goals(faults.goals(found))
+
+
+def start(
+    programs: Annotated[str, typer.Option(help="These programs.")] = ",".join(cold.PROGRAMS),
+    processes: Annotated[int, typer.Option(min=1, help="Processes of each program.")] = 50,
+    json: Json = None,
+) -> None:
+    """From the start of a process to its first answer."""
+    with checked():
+        chosen = cold.check_programs(split(programs))
+    isolate()
+    trials = Trials(cold.COMMAND, {"processes": processes})
+    total = processes * len(chosen)
+    with collected(trials, None, None, total, json) as add:
+        starts = cold.measure(chosen, processes, add)
+    make_console().print(make_table("", cold.heading, cold.rows(starts)))
+
+
+def publish(
+    files: Annotated[list[Path], typer.Argument(exists=True, help="Trials saved with --json.")],
+    out: Annotated[Path, typer.Option(help="The documentation's folder.")] = Path("docs"),
+) -> None:
+    """Write saved trials and their plots into docs/benchmarks.md, between their marks."""
+    page = out / "benchmarks.md"
+    for trials in Trials.load(files):
+        with checked():
+            text = section(trials, out)
+            page.write_text(replace_section(page.read_text(), trials.command, text))
+        typer.echo(f"{page}: {trials.command}")
+
+
+def section(trials: Trials, out: Path) -> str:
+    """Return the section of these trials, after drawing its plot."""
+    if trials.command == faults.COMMAND:
+        return faults.section(trials)
+    picture = f"benchmarks/{trials.command}.svg"
+    if trials.command == sharing.COMMAND:
+        save(sharing.draw(trials), out / picture)
+        return sharing.section(trials, picture)
+    save(cold.draw(trials), out / picture)
+    return cold.section(trials, picture)
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a plot as SVG and PNG, the same bytes for the same plot."""
+    matplotlib.rcParams["svg.hashsalt"] = "rosasync"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, metadata={"Date": None})
+    figure.savefig(path.with_suffix(".png"), dpi=120)
+
+
+@contextmanager
+def checked() -> Iterator[None]:
+    """Report a wrong argument as the command line does."""
+    try:
+        yield
+    except ValueError as exc:
+        raise typer.BadParameter(str(exc)) from None
+
+
+@contextmanager
+def collected(
+    trials: Trials,
+    heading: list[str] | None,
+    row: Callable[[Any], list[str]] | None,
+    total: int,
+    json: Path | None,
+) -> Iterator[Callable[[Any], None]]:
+    """Yield a function that takes each result; show and save what there is, also after Ctrl-C."""
+    console = make_console()
+    body = []
+    try:
+        with Progress(console=console) as progress:
+            task = progress.add_task("", total=total)
+
+            def add(result: Any) -> None:
+                trials.rows.append(dataclasses.asdict(result))
+                if row is not None:
+                    body.append(row(result))
+                progress.advance(task)
+
+            yield add
+    except NoHosts as exc:
+        console.print(f"skipped: {exc}", highlight=False)
+    finally:
+        if heading is not None:
+            console.print(make_table(trials.command, heading, body))
+        if json:
+            trials.save(json)
+
+
+def show_goals(goals: Iterable[Goal]) -> None:
+    body = [goal.row() for goal in goals if goal.met is not None]
+    if body:
+        make_console().print(make_table("goals", ["", "outcome"], body))
+
+
+def split(text: str, kind: Callable[[str], T] = str) -> list[T]:  # type: ignore[assignment]
+    """Return the parts of a list such as ``a,b,c``."""
+    return [kind(part.strip()) for part in text.split(",") if part.strip()]
