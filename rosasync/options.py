@@ -114,8 +114,10 @@ class Limits:
         waiting: the maximum number of callers that wait for each service; further callers get
             `PoolFull`.
         idle: seconds after which an unused client is destroyed.
-        grace: seconds for which a cancelled or timed-out request counts as outstanding, unless its
-            late response arrives sooner. It may still be in the server's queue.
+        grace: the maximum number of seconds for which a cancelled or timed-out request counts as
+            outstanding, because it may still be in the server's queue. It ends sooner if its late
+            response or the response to a later request arrives, if its server is gone, or if
+            callers wait and no response arrives for some time.
         server_depth: the depth of the server's queue, which all clients of the name share; a larger
             ``in_flight`` says that it is deeper. None if it is deep enough for all of them, so that
             each may use its whole ``in_flight``.
@@ -141,24 +143,33 @@ class Limits:
         if self.server_depth is not None:
             _set(self, "server_depth", check_count("server_depth", self.server_depth, 1))
 
-    def window(self, clients: int) -> int:
-        """Return the window of each client, given the number of clients in the graph."""
+    def share(self, clients: int) -> int:
+        """Return each client's share of the server's queue, for so many clients in the graph."""
         if self.server_depth is None:
             return self.in_flight
-        depth = max(self.server_depth, self.in_flight)
-        return min(self.in_flight, max(1, depth // max(1, clients)))
+        return max(1, max(self.server_depth, self.in_flight) // max(1, clients))
+
+    def window(self, clients: int) -> int:
+        """Return the window of each client, given the number of clients in the graph."""
+        return min(self.in_flight, self.share(clients))
 
 
 @dataclass(frozen=True, slots=True)
 class Retry:
     """When to send an unanswered request again; only for services that may run twice.
 
-    The first response to any attempt wins. The deadline still covers the whole call.
+    It is sent again after a delay, at once if three later requests of the same client were
+    answered, or at once to the next server if its servers have vanished. The first response to any
+    attempt wins. The deadline still covers the whole call.
 
     Attributes:
-        attempts: the maximum number of times the request is sent, including the first.
-        after: seconds to wait for a response before the second attempt.
+        attempts: the maximum number of times the request is sent, including the first. They start
+            anew with the next server, unless this is 1.
+        after: seconds to wait for a response before the second attempt. Each delay is longer at
+            random, by up to a quarter.
         backoff: the factor by which this wait grows with each further attempt.
+        budget: how many requests of the service may be sent again for each call, 0.2 for one in
+            five. Ten a second may be sent again besides. ``math.inf`` is no limit.
 
     Raises:
         TypeError: a value is not a number.
@@ -168,6 +179,7 @@ class Retry:
     attempts: int = 3
     after: float = 0.5
     backoff: float = 2.0
+    budget: float = 0.2
 
     def __post_init__(self) -> None:
         _set(self, "attempts", check_count("attempts", self.attempts, 1))
@@ -175,6 +187,9 @@ class Retry:
         _set(self, "backoff", _as_float("backoff", self.backoff, "a number"))
         if self.backoff < 1:
             raise ValueError(f"backoff must be at least 1, got {self.backoff!r}")
+        _set(self, "budget", _as_float("budget", self.budget, "a number"))
+        if self.budget < 0:
+            raise ValueError(f"budget must not be negative, got {self.budget!r}")
 
 
 @dataclass(frozen=True, slots=True)
