@@ -12,7 +12,7 @@ import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from sybil import Example, Sybil
 from sybil.parsers.markdown import CodeBlockParser
 
 import rosasync
+from rosasync.ros.domain import isolate
 from tests.support.process import ROOT, profile
 from tests.support.times import LIMIT
 
@@ -55,6 +56,7 @@ class Reader:
         self.programs: list[str] = []
         self.run_programs: set[str] = set()
         self.background = ExitStack()
+        self.environment: dict[str, str] = {}
 
     def follow(self, page: Path) -> None:
         sybil = Sybil(
@@ -76,11 +78,11 @@ class Reader:
             assert program.endswith(".py"), command
             self.run_programs.add(program)
             if program in SERVERS:
-                self.servers.start(program)
+                self.environment = self.servers.start(program)
             elif "second terminal" in remark:
                 self.background.enter_context(until_terminated(self.folder / program, expected))
             else:
-                printed = run(self.folder / program)
+                printed = run(self.folder / program, self.environment)
                 if order := re.search(r"lines (\d+) to (\d+) in any order", remark):
                     part = slice(int(order[1]) - 1, int(order[2]))
                     printed = with_sorted(printed, part)
@@ -93,23 +95,32 @@ class Servers:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._running: set[str] = set()
+        self._environments: dict[str, dict[str, str]] = {}
         self._stack = ExitStack()
 
-    def start(self, program: str) -> None:
-        if program in self._running:
-            return
-        path = self._folder / program
-        path.write_text(program_of(SERVERS[program], program))
-        environment = self._stack.enter_context(profile())
-        process = subprocess.Popen(
-            (sys.executable, str(path)), env=os.environ | environment, stderr=subprocess.DEVNULL
-        )
-        self._stack.callback(end, process)
-        self._running.add(program)
+    def start(self, program: str) -> dict[str, str]:
+        """Start a server in a ROS domain of its own; return the environment of its clients."""
+        if program not in self._environments:
+            path = self._folder / program
+            path.write_text(program_of(SERVERS[program], program))
+            self._environments[program] = environment = another_domain()
+            environment = environment | self._stack.enter_context(profile())
+            process = subprocess.Popen(
+                (sys.executable, str(path)), env=os.environ | environment, stderr=subprocess.DEVNULL
+            )
+            self._stack.callback(end, process)
+        return self._environments[program]
 
     def close(self) -> None:
         self._stack.close()
+
+
+def another_domain() -> dict[str, str]:
+    """Claim another ROS domain, so that a page sees its own servers only."""
+    own = os.environ["ROS_DOMAIN_ID"]
+    domain = isolate()
+    os.environ["ROS_DOMAIN_ID"] = own
+    return {"ROS_DOMAIN_ID": str(domain)}
 
 
 def end(process: subprocess.Popen[Any]) -> None:
@@ -136,11 +147,16 @@ def until_terminated(program: Path, expected: str) -> Iterator[None]:
     assert process.returncode == 0
 
 
-def run(program: Path) -> str:
+def run(program: Path, environment: Mapping[str, str]) -> str:
     """Run a program as the page says, with warnings about unclosed things as errors."""
-    command = (sys.executable, "-W", "error::ResourceWarning", program.name)
     return subprocess.run(
-        command, cwd=program.parent, stdout=subprocess.PIPE, text=True, timeout=120, check=True
+        (sys.executable, "-W", "error::ResourceWarning", program.name),
+        cwd=program.parent,
+        env=os.environ | environment,
+        stdout=subprocess.PIPE,
+        text=True,
+        timeout=120,
+        check=True,
     ).stdout
 
 
@@ -241,3 +257,9 @@ def test_the_plot_of_the_readme_shows_its_table() -> None:
     for _, _, latency, _, rate, *_ in rows:
         assert f">{latency.strip()}<" in plot
         assert f">{rate.strip()}<" in plot
+
+
+def test_the_links_of_the_readme_lead_somewhere() -> None:
+    links = re.findall(r"\]\((docs/[^)#]+)", (ROOT / "README.md").read_text())
+    assert len(links) > 10
+    assert not [link for link in links if not (ROOT / link).exists()]
