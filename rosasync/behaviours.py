@@ -102,8 +102,10 @@ class CallService(ServiceBehaviour[RequestT, ResponseT]):
     """Calls a service once in each run. It is RUNNING until the response arrives.
 
     It ends with SUCCESS if the call is answered, and with FAILURE if the call fails or if there is
-    no request. An interruption cancels the call. Each run unsets the response and the error on the
-    blackboard before it calls, so it never shows the result of an earlier run.
+    no request. If the response has a bool field ``success``, as those of ``SetBool`` and
+    ``Trigger``, the run fails unless it is true. An interruption cancels the call. Each run unsets
+    the response and the error on the blackboard before it calls, so it never shows the result of an
+    earlier run.
 
     Args:
         name: the name of the behaviour.
@@ -116,7 +118,8 @@ class CallService(ServiceBehaviour[RequestT, ResponseT]):
         key_response: the blackboard variable for the response.
         key_error: the blackboard variable for the exception of a failed run.
         key_feedback_message: the blackboard variable for the feedback message.
-        on_response: called with the response; it may return the status to end with.
+        on_response: called with the response; it may return the status to end with, whatever the
+            response's ``success`` says.
         on_error: called with the exception; it may return the status to end with.
         on_feedback: called with each new feedback message.
         timeout: seconds for the whole call; None for no deadline; if left out, the session's.
@@ -217,12 +220,17 @@ class CallService(ServiceBehaviour[RequestT, ResponseT]):
         return Status.FAILURE
 
     def _answered(self, response: ResponseT | None) -> Status:
-        self._set_feedback(f"{self.srv_name} answered")
+        # Only a bool: a number 0 often means that there was no error.
+        unsuccessful = getattr(response, "success", None) is False
+        outcome = f"answered without success{_reason(response)}" if unsuccessful else "answered"
+        self._set_feedback(f"{self.srv_name} {outcome}")
         self._set(self._key_response, response)
         status = None
         if self._on_response is not None and response is not None:
             status = self._on_response(response)
-        return Status.SUCCESS if status is None else status
+        if status is None:
+            return Status.FAILURE if unsuccessful else Status.SUCCESS
+        return status
 
     def _failed(self, error: Exception) -> Status:
         self._set_feedback(str(error))
@@ -318,7 +326,7 @@ class WaitForService(ServiceBehaviour[Any, Any]):
         name: the name of the behaviour.
         srv_type: a service class or its name.
         srv_name: the service's name.
-        timeout: seconds; None for no deadline, ``...`` for the session's.
+        timeout: seconds; None, or left out, for no deadline; ``...`` for the session's.
         qos: a ``QoSProfile``; None for the service default with a history of 1,000.
         session: the session; None to take it from ``tree.setup(session=…)``.
 
@@ -356,3 +364,8 @@ class WaitForService(ServiceBehaviour[Any, Any]):
             return Status.SUCCESS
         self.feedback_message = "; ".join(map(str, proxy.get_errors())) or "aborted"
         return Status.FAILURE
+
+
+def _reason(response: object) -> str:
+    message = getattr(response, "message", None)
+    return f": {message}" if message and isinstance(message, str) else ""

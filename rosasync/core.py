@@ -65,10 +65,19 @@ class Core:
     def check_loop(self) -> None:
         """Raise `UsageError` on any other loop or thread than the session's."""
         if asyncio._get_running_loop() is not self.loop:
-            raise UsageError(
-                "a session is used in the loop that opened it; from other threads use "
-                "session.from_thread"
-            )
+            raise UsageError(self._explain_loop())
+
+    def _explain_loop(self) -> str:
+        """Return what is wrong with the caller's loop or thread, and what to do."""
+        name = f"session {self.name!r}"
+        if not self.gateway.on_thread:
+            return f"{name} belongs to the loop of another thread: use session.from_thread here"
+        if asyncio._get_running_loop() is None:
+            return f"{name} is used without a running event loop: use it in a coroutine of its loop"
+        return (
+            f"{name} belongs to another event loop, and asyncio.run makes a new one each time: "
+            "open a session in each loop, or run everything in one"
+        )
 
     def serve(
         self, srv_type: Any, srv_name: str, handler: Any, **options: Any

@@ -258,7 +258,10 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
         if result is not None:
             call.respond(result)
         elif not self._kind.may_defer:
-            raise TypeError("the handler returned None instead of the response")
+            raise TypeError(
+                "the handler returned None instead of the response: end it with `return response`; "
+                "to respond later, take one argument, `call`, and use call.respond(response)"
+            )
         elif not call.settled:
             self._counts.deferred += 1
 

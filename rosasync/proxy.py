@@ -170,7 +170,7 @@ class AsyncServiceProxy(Generic[RequestT, ResponseT]):
         """Wait for a server, which replaces the previous operation. The state becomes WAITING.
 
         Args:
-            timeout: seconds; None for no deadline, ``...`` for the session's.
+            timeout: seconds; None, or left out, for no deadline; ``...`` for the session's.
 
         Raises:
             TypeError, ValueError: the timeout does not fit; the state is unchanged.

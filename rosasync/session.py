@@ -6,12 +6,13 @@ import asyncio
 import importlib
 from collections.abc import Callable, Mapping
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Generic, Literal, Self, overload
+from typing import TYPE_CHECKING, Any, Generic, Literal, NoReturn, Self, overload
 
 from rosasync.aio import start_task
 from rosasync.core import Core, session_closed
 from rosasync.errors import UsageError
 from rosasync.options import Limits, Retry, SessionOptions, check_timeout
+from rosasync.ros.middleware import check_middleware
 from rosasync.statistics import SessionStatistics
 from rosasync.typing import RequestT, ResponseT, ServiceType, Timeout
 
@@ -104,7 +105,8 @@ class Session:
         """Open the session in the running loop.
 
         Raises:
-            ImportError: rclpy is not installed; the message says how to install it.
+            ImportError: rclpy is not installed, or the middleware that ``RMW_IMPLEMENTATION``
+                names; the message says what to do.
             UsageError: the session was opened before, or the bridge asked for does not work here.
             TypeError: ``node`` is neither a name nor an rclpy node.
             ValueError: ROS does not allow the node's name.
@@ -114,6 +116,17 @@ class Session:
             raise UsageError("a session can be opened only once: create a new one")
         self._core = Core(self, self._options, self._open_node)
         return self
+
+    def __enter__(self) -> NoReturn:
+        """Raise `UsageError`: a session needs ``async with``."""
+        raise UsageError(
+            "a session is opened with `async with`, not `with`: "
+            "`async with rosasync.Session(…) as session:`"
+        )
+
+    def __exit__(self, *exc: object) -> None:
+        # `with` looks it up before it calls `__enter__`.
+        raise AssertionError("never entered")
 
     async def __aexit__(
         self,
@@ -345,7 +358,7 @@ class Session:
         Args:
             srv_type: a service class or its name.
             srv_name: the service's name.
-            timeout: seconds, None for no deadline, ``...`` for the session's.
+            timeout: seconds; None, or left out, for no deadline; ``...`` for the session's.
             qos: as for `call`.
 
         Raises:
@@ -566,8 +579,10 @@ def _import_ros(module: str) -> Any:
     """Import a module that needs rclpy.
 
     Raises:
-        ImportError: rclpy is not installed; the message says how to install it.
+        ImportError: rclpy is not installed, or the middleware that the environment names; the
+            message says what to do.
     """
+    check_middleware()
     try:
         return importlib.import_module(module)
     except ImportError as error:

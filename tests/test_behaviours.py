@@ -8,6 +8,7 @@ import sys
 import threading
 from collections.abc import AsyncIterator, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Literal
 
 import py_trees
@@ -15,6 +16,7 @@ import pytest
 from py_trees.common import Access, Status
 from py_trees.decorators import Retry, Timeout
 from py_trees.trees import BehaviourTree
+from std_srvs.srv import SetBool
 
 from rosasync import (
     AsyncServiceProxy,
@@ -105,6 +107,53 @@ class TestOutcomes:
     ) -> None:
         leaf = ready(CallService("leaf", ECHO, NAME, on_response=lambda _: status), fake_session)
         assert await ticked(leaf) is (status or Status.SUCCESS)
+
+    @pytest.mark.parametrize(
+        ("response", "status", "message"),
+        [
+            (SetBool.Response(success=True), Status.SUCCESS, "/echo answered"),
+            (SetBool.Response(success=False), Status.FAILURE, "/echo answered without success"),
+            (
+                SetBool.Response(message="locked"),
+                Status.FAILURE,
+                "/echo answered without success: locked",
+            ),
+            (SimpleNamespace(success=0), Status.SUCCESS, "/echo answered"),
+        ],
+    )
+    async def test_a_response_with_the_field_success_is_judged_by_it(
+        self, response: Any, status: Status, message: str
+    ) -> None:
+        graph = FakeGraph()
+        graph.serve(ECHO, NAME, lambda _: response)
+        async with graph.session() as session:
+            leaf = ready(CallService("leaf", ECHO, NAME, key_response="answer"), session)
+            assert await ticked(leaf) is status
+            assert leaf.feedback_message == message
+            assert blackboard("answer").answer == response
+
+    @pytest.mark.parametrize("status", [Status.SUCCESS, Status.FAILURE, None])
+    @pytest.mark.parametrize("success", [True, False])
+    async def test_unless_the_callback_says_otherwise(
+        self, success: bool, status: Status | None
+    ) -> None:
+        graph = FakeGraph()
+        graph.serve(ECHO, NAME, lambda _: SetBool.Response(success=success))
+        async with graph.session() as session:
+            leaf = CallService("leaf", ECHO, NAME, on_response=lambda _: status)
+            judged = Status.SUCCESS if success else Status.FAILURE
+            assert await ticked(ready(leaf, session)) is (status or judged)
+
+    async def test_left_out_the_sessions_timeout_holds_and_none_is_no_deadline(
+        self, graph: FakeGraph
+    ) -> None:
+        async with graph.session(timeout=TICK) as session:
+            call, endless = CallService("a", ECHO, NAME), CallService("b", ECHO, NAME, timeout=None)
+            with graph.drop_requests():
+                ready(endless, session).tick_once()
+                assert await ticked(ready(call, session)) is Status.FAILURE
+                endless.tick_once()
+                assert endless.status is Status.RUNNING
 
     async def test_a_deadline_is_failure(self, graph: FakeGraph, fake_session: Session) -> None:
         errors: list[Exception] = []

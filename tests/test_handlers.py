@@ -242,7 +242,9 @@ class TestErrors:
             lambda request, response: None,
             on_error=lambda call, error: Response(message=str(error)),
         )
-        assert "None" in await ask(session, "/served", "text")
+        answer = await ask(session, "/served", "text")
+        assert answer.startswith("the handler returned None")
+        assert "`return response`" in answer
         assert server.statistics().failed == 1
         assert server.statistics().deferred == 0
 

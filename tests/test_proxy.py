@@ -316,6 +316,23 @@ async def test_without_a_timeout_the_sessions_holds() -> None:
         assert other.get_state() is RUNNING
 
 
+async def test_none_is_no_deadline_and_so_is_a_wait_without_a_timeout() -> None:
+    graph = FakeGraph()
+    graph.serve(ECHO, NAME, lambda _: None)
+    async with graph.session(timeout=TICK) as session:
+        call, wait = (AsyncServiceProxy(session, ECHO, NAME) for _ in range(2))
+        first, last = (AsyncServiceProxy(session, ECHO, "/absent") for _ in range(2))
+        with graph.drop_requests():
+            call.call_service(None, None)
+            wait.wait_for_service(None)
+            first.wait_for_service()
+            last.wait_for_service(...)
+            assert await settled(last) is TIMEOUT
+            assert call.get_state() is RUNNING
+        assert first.get_state() is WAITING
+        assert wait.get_state() is ProxyState.SERVICE_AVAILABLE
+
+
 async def test_the_deadline_counts_from_the_tick_that_asked() -> None:
     async with staged() as stage:
         stage.serve()

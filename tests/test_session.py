@@ -22,6 +22,7 @@ from rosasync import (
     SessionClosed,
     UsageError,
 )
+from rosasync.testing import FakeGraph
 from tests.support.checks import assert_clean, check_call
 from tests.support.echo import ECHO, answer_to, request_of
 from tests.support.flood import blocked_loop, call_in_bursts, start_flood
@@ -470,9 +471,27 @@ class TestBadInput:
         with pytest.raises((SessionClosed, UsageError)):
             await session.__aenter__()
 
+    def test_opened_without_async(self) -> None:
+        with (
+            pytest.raises(UsageError, match="async with rosasync.Session"),
+            Session("plain"),
+        ):
+            pytest.fail("it is not open")
+
+    def test_in_two_loops_of_one_thread(self) -> None:
+        session = FakeGraph().session()
+        first = asyncio.new_event_loop()
+        first.run_until_complete(session.__aenter__())
+        with pytest.raises(UsageError, match="open a session in each loop"):
+            asyncio.run(session.call(ECHO, "/echo"))
+        with pytest.raises(UsageError, match="in a coroutine of its loop"):
+            session.start(ECHO, "/echo")
+        first.run_until_complete(session.aclose())
+        first.close()
+
     async def test_from_another_loop(self, session: Session, echo: str) -> None:
         def elsewhere() -> None:
-            with pytest.raises(UsageError):
+            with pytest.raises(UsageError, match="use session.from_thread"):
                 asyncio.run(session.call(ECHO, echo))
             with pytest.raises(UsageError):
                 asyncio.run(session.aclose())

@@ -1,23 +1,83 @@
-"""The commands of ``rosasync``; `rosasync.__main__` starts them."""
+"""The commands of ``rosasync``, and how the process ends; `rosasync.__main__` starts it."""
 
 from __future__ import annotations
 
+import signal
+import sys
 from importlib.metadata import PackageNotFoundError, version
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from rosasync.demo.run import DemoError, run_demo
+from rosasync.cli import lifecycle, param
+from rosasync.cli.bench import bench
+from rosasync.cli.call import call
+from rosasync.cli.demo import demo
+from rosasync.cli.doctor import doctor
+from rosasync.cli.errors import Code, join
+from rosasync.cli.listing import find, info, list_services, nodes, type_of
+from rosasync.cli.ping import ping
+from rosasync.cli.profile import profile
+from rosasync.cli.run import fail, silence_stdout
+from rosasync.cli.serve import serve
+from rosasync.cli.show import show
+from rosasync.cli.watch import watch
+from rosasync.cli.why import why
 
-__all__ = ["app"]
+__all__ = ["app", "main"]
+
+# typer has its own copy of click in its newer versions, so the class cannot be imported.
+_UsageError: Any = typer.BadParameter.__mro__[1]
 
 app = typer.Typer(
     name="rosasync",
-    help="ROS 2 service calls, native to asyncio.",
-    add_completion=False,
+    help="ROS 2 services from the command line.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,
 )
+
+app.command()(call)
+app.command("list")(list_services)
+app.command("type")(type_of)
+app.command()(find)
+app.command()(show)
+app.command()(info)
+app.command()(nodes)
+app.command()(serve)
+app.command()(watch)
+app.command()(bench)
+app.command()(ping)
+app.command()(why)
+app.command()(doctor)
+app.command()(profile)
+app.command()(demo)
+app.add_typer(param.app, name="param")
+app.add_typer(lifecycle.app, name="lifecycle")
+
+
+def main() -> int:
+    """Run the command line and return the exit code."""
+    try:
+        code = app(prog_name="rosasync", standalone_mode=False) or 0
+        sys.stdout.flush()
+    except _UsageError as error:
+        fail(_line_of(error))
+        code = Code.USAGE
+    except (KeyboardInterrupt, typer.Abort):
+        code = Code.INTERRUPTED
+    except BrokenPipeError:
+        silence_stdout()
+        code = Code.PIPE_CLOSED
+    # The interpreter takes some milliseconds to end: a Ctrl-C then prints no traceback.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    return int(code)
+
+
+def _line_of(error: Any) -> str:
+    command = error.ctx.command_path if error.ctx else "rosasync"
+    text = " ".join(error.format_message().split())
+    return join(text, f"Try: {command} --help")
 
 
 def _print_version(wanted: bool) -> None:
@@ -40,23 +100,3 @@ def _main(
     ] = False,
 ) -> None:
     pass
-
-
-@app.command()
-def demo(
-    calls: Annotated[
-        int,
-        typer.Option(min=1, help="Calls of each contestant one at a time, and again ten at once."),
-    ] = 2000,
-    seconds: Annotated[float, typer.Option(min=0.1, help="Seconds to measure at most.")] = 8.0,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
-) -> None:
-    """Call a stock rclpy server with rosasync and with client.call, and compare them.
-
-    The server runs in its own process, in a ROS domain that nothing else on this machine uses.
-    """
-    try:
-        run_demo(calls=calls, seconds=seconds, as_json=as_json)
-    except DemoError as error:
-        typer.echo(f"rosasync demo: {error}", err=True)
-        raise typer.Exit(1) from None

@@ -197,10 +197,10 @@ def _shares(latencies: list[float], edges: list[float]) -> list[float]:
     ]
 
 
-def run_demo(*, calls: int = 2000, seconds: float = 8.0, as_json: bool = False) -> None:
+async def run_demo(*, calls: int = 2000, seconds: float = 8.0, as_json: bool = False) -> None:
     """Run the demo and print the results to standard output; progress goes to standard error.
 
-    Call it on the main thread. It moves the process into an unused ROS domain.
+    It moves the process into an unused ROS domain.
 
     Args:
         calls: number of calls of each contestant one at a time, and again ten at once.
@@ -209,11 +209,10 @@ def run_demo(*, calls: int = 2000, seconds: float = 8.0, as_json: bool = False) 
 
     Raises:
         DemoError: the calls could not be made, or a response was wrong.
-        KeyboardInterrupt: after Ctrl-C, when the server process has ended.
     """
     isolate()
     try:
-        report = asyncio.run(_run(calls, seconds))
+        report = await _run(calls, seconds)
     except ImportError as error:
         raise DemoError(str(error)) from error
     except rosasync.RosasyncError as error:

@@ -78,8 +78,9 @@ def refusal(node: Node, service: Service, kind: str, error: Exception) -> Except
     if "incompatible type" in str(error):
         return UsageError(
             f"{srv_name}: this process already has a client or server of this name with another "
-            f"type than {srv_type}, and the middleware allows only one type: use another name, "
-            "or close the other one first"
+            f"type than {srv_type}, and the middleware allows only one type: check which type is "
+            "the right one; or use another name, or close the server, node or session of the other "
+            "one first"
         )
     return RosasyncError(
         f"{srv_name}: the middleware refused to create the {kind} of type {srv_type}; check the "

@@ -23,9 +23,12 @@ import struct
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Literal
 
 __all__ = [
+    "FieldType",
+    "field_types",
     "request_message",
     "service_type",
     "to_dict",
@@ -138,6 +141,32 @@ def to_dict(message: object) -> dict[str, Any]:
     return {name: field.to_plain(getattr(message, name)) for name, field in fields.items()}
 
 
+@dataclass(frozen=True, slots=True)
+class FieldType:
+    """The type of a field.
+
+    Attributes:
+        label: as in a .msg file, ``"float64[36]"``.
+        kind: what its values are.
+        message_type: the class of a message field.
+        element: the type of the elements of an array or a sequence.
+    """
+
+    label: str
+    kind: Literal["bool", "int", "float", "byte", "string", "message", "sequence"]
+    message_type: type[Any] | None = None
+    element: FieldType | None = None
+
+
+def field_types(message_type: type[Any]) -> dict[str, FieldType]:
+    """Return the type of each field of a message class, by name.
+
+    Raises:
+        TypeError: not a message class.
+    """
+    return {name: field.describe() for name, field in _fields(message_type).items()}
+
+
 def _given(value: object) -> str:
     """Describe a value for an error: by its type, and by the value itself if it is a scalar."""
     if value is None:
@@ -231,6 +260,9 @@ class _Field(ABC):
     def to_plain(self, value: Any) -> Any:
         return value
 
+    def describe(self) -> FieldType:
+        return FieldType(self.label, "string")
+
     def refuse(self, value: object) -> _InvalidField:
         return _InvalidField(TypeError, f"expected {self.label}, got {_given(value)}")
 
@@ -243,6 +275,9 @@ class _Boolean(_Field):
 
     def to_plain(self, value: Any) -> bool:
         return bool(value)
+
+    def describe(self) -> FieldType:
+        return FieldType(self.label, "bool")
 
 
 class _Integer(_Field):
@@ -272,6 +307,9 @@ class _Integer(_Field):
     def to_plain(self, value: Any) -> int:
         return int(value)
 
+    def describe(self) -> FieldType:
+        return FieldType(self.label, "int")
+
 
 class _Float(_Field):
     def __init__(self, label: str, typecode: str, limit: float) -> None:
@@ -296,6 +334,9 @@ class _Float(_Field):
     def to_plain(self, value: Any) -> float:
         return float(value)
 
+    def describe(self) -> FieldType:
+        return FieldType(self.label, "float")
+
     def _out_of_range(self, value: object) -> _InvalidField:
         return _InvalidField(
             ValueError,
@@ -315,6 +356,9 @@ class _Octet(_Field):
         if not isinstance(value, numbers.Integral) or isinstance(value, bool):
             raise self.refuse(value)
         return bytes((_UINT8.to_ros(value),))
+
+    def describe(self) -> FieldType:
+        return FieldType(self.label, "byte")
 
 
 class _Character(_Field):
@@ -373,6 +417,9 @@ class _Nested(_Field):
     def to_plain(self, value: Any) -> dict[str, Any]:
         return to_dict(value)
 
+    def describe(self) -> FieldType:
+        return FieldType(self.label, "message", message_type=self.message_type)
+
 
 class _Sequence(_Field):
     """An array, of which ``least`` equals ``most``, or a sequence, bounded or not."""
@@ -398,6 +445,9 @@ class _Sequence(_Field):
 
     def to_plain(self, value: Any) -> Any:
         return [self.element.to_plain(item) for item in value]
+
+    def describe(self) -> FieldType:
+        return FieldType(self.label, "sequence", element=self.element.describe())
 
     def items(self, value: object) -> Sequence[Any]:
         if isinstance(value, Sequence) and not isinstance(value, str | bytes | bytearray):

@@ -16,7 +16,7 @@ from rosasync.ros.failures import uses_node
 from rosasync.ros.messages import service_type, type_name
 from rosasync.statistics import ServiceKey
 
-__all__ = ["default_qos", "describe"]
+__all__ = ["default_qos", "describe", "resolve_name"]
 
 DEPTH = 1000
 """History of the default QoS. With rclpy's default of ten, requests and responses get lost."""
@@ -28,7 +28,7 @@ def describe(node: Node, srv_type: Any, srv_name: str, qos: Any) -> Service:
         raise TypeError(f"qos must be an rclpy QoSProfile, not {type(qos).__name__}")
     srv_class = service_type(srv_type)
     qos_key = None if qos is None else str(qos)
-    key = ServiceKey(_resolve(node, srv_name), type_name(srv_class), qos_key)
+    key = ServiceKey(resolve_name(node, srv_name), type_name(srv_class), qos_key)
     return Service(srv_class, srv_name, qos, key)
 
 
@@ -40,8 +40,13 @@ def default_qos() -> QoSProfile:
     return qos
 
 
-def _resolve(node: Node, srv_name: str) -> str:
-    """Return the expanded and remapped name."""
+def resolve_name(node: Node, srv_name: str) -> str:
+    """Return the expanded and remapped name of a service.
+
+    Raises:
+        InvalidServiceName: ROS does not allow the name.
+        TypeError: not a str.
+    """
     if not isinstance(srv_name, str):
         raise TypeError(f"a service name must be a str, not {type(srv_name).__name__}")
     try:

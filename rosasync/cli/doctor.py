@@ -1,0 +1,201 @@
+"""``rosasync doctor``: whether services can work on this machine."""
+
+from __future__ import annotations
+
+import asyncio
+import importlib.util
+import os
+import platform
+import shutil
+import socket
+import sys
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
+from pathlib import Path
+
+import rosasync
+from rosasync.cli.checks import Report
+from rosasync.cli.errors import Code
+from rosasync.cli.options import AsJson
+from rosasync.cli.run import open_session, run
+from rosasync.cli.why import environment
+from rosasync.ros.middleware import check_middleware, installed_middlewares
+
+__all__ = ["doctor"]
+
+SHARED_MEMORY = Path("/dev/shm")
+ENOUGH = 64 << 20
+"""Bytes of shared memory that some tens of Fast DDS processes need."""
+
+MULTICAST = "239.255.0.1"
+"""The group in which RTPS participants announce themselves (RTPS 2.5, 9.6.1)."""
+
+DISCOVERY = 10.0
+SRV_TYPE = "diagnostic_msgs/srv/AddDiagnostics"
+PROFILES = (
+    "ROSASYNC_PROFILE",
+    "FASTRTPS_DEFAULT_PROFILES_FILE",
+    "FASTDDS_DEFAULT_PROFILES_FILE",
+)
+
+
+def doctor(as_json: AsJson = False) -> None:
+    r"""Say whether services can work on this machine.
+
+    Each check that fails says what to do. It starts a server process of its own and calls it.
+
+    \b
+    Examples:
+      $ rosasync doctor
+      $ rosasync doctor --json
+    """
+    run(_doctor(as_json))
+
+
+async def _doctor(as_json: bool) -> int:
+    report = Report(as_json)
+    report.add("python", True, f"{platform.python_version()}, {sys.executable}")
+    if _rclpy(report) and _middleware(report):
+        environment(report)
+        _shared_memory(report)
+        _multicast(report)
+        _profile(report)
+        await _calls(report)
+    return Code.FAILED if report.failed else Code.ANSWERED
+
+
+def _rclpy(report: Report) -> bool:
+    found = importlib.util.find_spec("rclpy")
+    report.add(
+        "rclpy",
+        found is not None,
+        f"from {Path(found.origin or '').parent}" if found else "not installed for this Python",
+        "pip install 'rosasync[jazzy]' (or [kilted]), or source /opt/ros/<distribution>/setup.bash "
+        "and use its Python",
+    )
+    return found is not None
+
+
+def _middleware(report: Report) -> bool:
+    wanted = os.environ.get("RMW_IMPLEMENTATION")
+    there = ", ".join(installed_middlewares()) or "none found"
+    try:
+        check_middleware()
+    except ImportError as error:
+        report.add("middleware", False, str(error), "Unset RMW_IMPLEMENTATION")
+        return False
+    shown = f"RMW_IMPLEMENTATION={wanted}" if wanted else "RMW_IMPLEMENTATION is not set"
+    report.add("middleware", True, f"{shown}; installed: {there}")
+    return True
+
+
+def _shared_memory(report: Report) -> None:
+    """Check that Fast DDS can use shared memory; without it, it falls back to UDP."""
+    usable = os.access(SHARED_MEMORY, os.W_OK | os.X_OK)
+    free = shutil.disk_usage(SHARED_MEMORY).free if usable else 0
+    files = len(list(SHARED_MEMORY.glob("fast*")))
+    report.add(
+        "shared memory",
+        usable and free > ENOUGH,
+        f"{free >> 20} MB free in {SHARED_MEMORY}, {files} files of Fast DDS",
+        "Give a container more: docker run --shm-size=1g, or --ipc=host. Files of killed processes "
+        "can be removed when no ROS process runs: fastdds shm clean",
+    )
+
+
+def _multicast(report: Report) -> None:
+    """Send a packet to a multicast group, and receive it."""
+    problem = None
+    try:
+        with (
+            socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver,
+            socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
+        ):
+            receiver.bind(("", 0))
+            group = socket.inet_aton(MULTICAST) + socket.inet_aton("0.0.0.0")
+            receiver.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, group)
+            receiver.settimeout(1.0)
+            sender.sendto(b"rosasync", (MULTICAST, receiver.getsockname()[1]))
+            receiver.recv(16)
+    except OSError as error:
+        problem = str(error)
+    local = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper() == "LOCALHOST"
+    ok = True if problem is None else None if local else False
+    report.add(
+        "multicast",
+        ok,
+        f"a packet to {MULTICAST} came back" if ok else f"none came back: {problem}",
+        "Other machines are found by multicast: allow it in the firewall and the network, or name "
+        "them in ROS_STATIC_PEERS",
+    )
+
+
+def _profile(report: Report) -> None:
+    """Say which profile of Fast DDS is in use."""
+    found = {name: os.environ[name] for name in PROFILES if os.environ.get(name)}
+    missing = [f"{n}={v}" for n, v in found.items() if "/" in v and not Path(v).is_file()]
+    report.add(
+        "profile",
+        not missing if missing else None,
+        ", ".join(f"{name}={value}" for name, value in found.items()) or "none in the environment",
+        f"There is no such file: {', '.join(missing)}" if missing else _profile_hint(),
+    )
+
+
+def _profile_hint() -> str:
+    if importlib.util.find_spec("rosasync.cli.profile") is None:
+        return ""
+    return "A profile with frequent heartbeats helps where packets get lost: rosasync profile"
+
+
+async def _calls(report: Report) -> None:
+    """Discover and call a server in this process, and one in another."""
+    from rosasync.ros.inspect import bridge_reason
+
+    report.add("bridge", True, bridge_reason())
+    name = f"/_rosasync_doctor_{os.getpid()}"
+    async with open_session(DISCOVERY) as session:
+        async with session.serve(SRV_TYPE, f"{name}/own", lambda _, response: response):
+            await _try(report, session, "call to itself", f"{name}/own", {})
+        async with _server_process(f"{name}/other"):
+            await _try(report, session, "other process", f"{name}/other", {})
+
+
+async def _try(
+    report: Report, session: rosasync.Session, check: str, name: str, request: dict[str, str]
+) -> None:
+    begin = time.perf_counter()
+    try:
+        await session.wait_for_service(SRV_TYPE, name, timeout=DISCOVERY)
+        discovered = time.perf_counter()
+        await session.call(SRV_TYPE, name, request)
+    except rosasync.CallError as error:
+        advice = "Look at the checks above: shared memory, multicast, and a firewall"
+        report.add(check, False, " ".join(str(error).split()), advice)
+    else:
+        discovery, call = discovered - begin, time.perf_counter() - discovered
+        report.add(check, True, f"discovered in {discovery:.2f} s, answered in {1e3 * call:.1f} ms")
+
+
+@asynccontextmanager
+async def _server_process(name: str) -> AsyncIterator[None]:
+    """Run a stock server in its own process and session, so that Ctrl-C does not reach it."""
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "rosasync.demo.stock", name),
+        stdin=asyncio.subprocess.PIPE,
+        stdout=asyncio.subprocess.PIPE,
+        start_new_session=True,
+    )
+    assert process.stdin is not None
+    assert process.stdout is not None
+    try:
+        await process.stdout.readline()
+        yield
+    finally:
+        process.stdin.close()
+        with suppress(TimeoutError):
+            await asyncio.wait_for(asyncio.shield(process.wait()), 2.0)
+        if process.returncode is None:
+            process.kill()
+            await process.wait()

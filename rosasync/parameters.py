@@ -1,0 +1,641 @@
+"""Parameters of other nodes, over the session's pool.
+
+::
+
+    arm = ParameterClient(session, "/arm")
+    await arm.set("speed", 0.5)
+    print(await arm.get("speed"))
+
+Values are plain Python values:
+
+=============  ====================================================================
+parameter      Python
+=============  ====================================================================
+bool           bool
+integer        int, NumPy's integers; not bool
+double         float, NumPy's floats; not int
+string         str
+byte array     bytes; also bytearray, and a list of single bytes
+other arrays   a list; also a tuple, an ``array.array``, a one-dimensional NumPy array
+not set        None
+=============  ====================================================================
+
+A list of both int and float is a double array. An empty list takes the type that the node has for
+the parameter.
+"""
+
+from __future__ import annotations
+
+import enum
+import numbers
+import os
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any, TypeAlias, overload
+
+import anyio
+
+from rosasync import RosasyncError, to_dict
+
+if TYPE_CHECKING:
+    from rosasync import Session
+    from rosasync.typing import Timeout
+
+__all__ = [
+    "ParameterClient",
+    "ParameterDescriptor",
+    "ParameterError",
+    "ParameterRange",
+    "ParameterType",
+]
+
+# `ParameterClient.list` hides the built-in one from the annotations in its class.
+Names: TypeAlias = list[str]
+# Not an Iterable of them, because a single name is one too.
+Several: TypeAlias = list[str] | tuple[str, ...] | Set[str]
+
+NOT_DECLARED = "it is not declared, or has no value"
+
+
+class ParameterType(enum.IntEnum):
+    """The type of a parameter; the values are those of ``rcl_interfaces/msg/ParameterType``."""
+
+    NOT_SET = 0
+    BOOL = 1
+    INTEGER = 2
+    DOUBLE = 3
+    STRING = 4
+    BYTE_ARRAY = 5
+    BOOL_ARRAY = 6
+    INTEGER_ARRAY = 7
+    DOUBLE_ARRAY = 8
+    STRING_ARRAY = 9
+
+    @property
+    def field(self) -> str:
+        """The field of ``rcl_interfaces/msg/ParameterValue`` that holds such a value."""
+        return f"{self.name.lower()}_value"
+
+    @property
+    def is_array(self) -> bool:
+        """Whether it is one of the arrays."""
+        return self >= ParameterType.BYTE_ARRAY
+
+
+ARRAY_OF = {
+    ParameterType.BOOL: ParameterType.BOOL_ARRAY,
+    ParameterType.INTEGER: ParameterType.INTEGER_ARRAY,
+    ParameterType.DOUBLE: ParameterType.DOUBLE_ARRAY,
+    ParameterType.STRING: ParameterType.STRING_ARRAY,
+}
+"""The type of an array, by the type of its elements."""
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterRange:
+    """The values that a number may take.
+
+    Attributes:
+        minimum: the smallest value.
+        maximum: the largest value.
+        step: the distance of the values from the minimum is a multiple of this; 0 for any value.
+    """
+
+    minimum: float
+    maximum: float
+    step: float
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterDescriptor:
+    """What a node says about one of its parameters.
+
+    Attributes:
+        name: the parameter's name.
+        type: its type.
+        description: what it is for.
+        constraints: constraints in plain English, besides the range.
+        read_only: whether it can be set only when the node starts.
+        dynamic_typing: whether its type may change.
+        range: the values that a number may take; None for any.
+    """
+
+    name: str
+    type: ParameterType
+    description: str = ""
+    constraints: str = ""
+    read_only: bool = False
+    dynamic_typing: bool = False
+    range: ParameterRange | None = None
+
+
+class ParameterError(RosasyncError):
+    """A node refused to set parameters, or does not have them. It can be copied and pickled.
+
+    Attributes:
+        node_name: the node's full name.
+        reasons: the reason for each parameter concerned, by its name.
+    """
+
+    def __init__(self, message: str, *, node_name: str, reasons: Mapping[str, str]) -> None:
+        super().__init__(message)
+        self.node_name = node_name
+        self.reasons = dict(reasons)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Exceptions are copied from their positional arguments, and these are keywords.
+        make = partial(type(self), node_name=self.node_name, reasons=self.reasons)
+        return make, self.args, self.__dict__
+
+    @property
+    def name(self) -> str:
+        """The first of the parameters."""
+        return next(iter(self.reasons))
+
+    @property
+    def reason(self) -> str:
+        """The reason for the first of the parameters."""
+        return self.reasons[self.name]
+
+
+class ParameterClient:
+    """Reads and writes the parameters of another node.
+
+    It owns nothing: its calls share the clients of the session's pool. So many of them may be
+    awaited at a time, of one node and of many nodes::
+
+        speeds = await asyncio.gather(
+            *(ParameterClient(session, name).get("speed") for name in names)
+        )
+
+    Each method also raises what `Session.call` raises, such as `ServiceUnavailable` if there is no
+    such node, or if it has no parameter services.
+
+    Args:
+        session: an open session.
+        node_name: the node's name, ``"/arm"``. Relative names are resolved as service names are.
+        timeout: seconds for each call, None for no deadline; if left out, the session's. Each
+            method takes a ``timeout`` of its own, and the client's is used if that is left out.
+
+    Raises:
+        InvalidServiceName: ROS does not allow the name.
+        TypeError, ValueError: the timeout does not fit.
+        UsageError: the session is not open, or belongs to another loop or thread.
+        SessionClosed, ContextShutdown: the session has ended.
+    """
+
+    def __init__(self, session: Session, node_name: str, *, timeout: Timeout = ...) -> None:
+        service = session.client(
+            "rcl_interfaces/srv/GetParameters", f"{node_name}/get_parameters", timeout=timeout
+        )
+        self._session = session
+        self._timeout = timeout
+        self._node_name = service.srv_name.removesuffix("/get_parameters")
+
+    def __repr__(self) -> str:
+        return f"<ParameterClient {self._node_name}>"
+
+    @property
+    def node_name(self) -> str:
+        """The node's full name."""
+        return self._node_name
+
+    @overload
+    async def get(self, names: str, /, *, timeout: Timeout = ...) -> Any: ...
+
+    @overload
+    async def get(self, names: Several, /, *, timeout: Timeout = ...) -> dict[str, Any]: ...
+
+    async def get(self, names: str | Several, /, *, timeout: Timeout = ...) -> Any:
+        """Return the value of a parameter, or a dict of the values of several.
+
+        Args:
+            names: a name, or several.
+            timeout: seconds for each call, None for no deadline; if left out, the client's.
+
+        Raises:
+            ParameterError: a parameter is not declared, or has no value.
+        """
+        values = await self._ask_all("GetParameters", "values", names, timeout)
+        return _one_or_all(names, {name: _from_ros(value) for name, value in values.items()})
+
+    @overload
+    async def describe(self, names: str, /, *, timeout: Timeout = ...) -> ParameterDescriptor: ...
+
+    @overload
+    async def describe(
+        self, names: Several, /, *, timeout: Timeout = ...
+    ) -> dict[str, ParameterDescriptor]: ...
+
+    async def describe(self, names: str | Several, /, *, timeout: Timeout = ...) -> Any:
+        """Return the descriptor of a parameter, or a dict of the descriptors of several.
+
+        Args:
+            names: a name, or several.
+            timeout: seconds for each call, None for no deadline; if left out, the client's.
+
+        Raises:
+            ParameterError: a parameter is not declared.
+        """
+        found = await self._ask_all("DescribeParameters", "descriptors", names, timeout)
+        return _one_or_all(names, {name: _descriptor(one) for name, one in found.items()})
+
+    @overload
+    async def types(self, names: str, /, *, timeout: Timeout = ...) -> ParameterType: ...
+
+    @overload
+    async def types(
+        self, names: Several, /, *, timeout: Timeout = ...
+    ) -> dict[str, ParameterType]: ...
+
+    async def types(self, names: str | Several, /, *, timeout: Timeout = ...) -> Any:
+        """Return the type of a parameter, or a dict of the types of several.
+
+        Args:
+            names: a name, or several.
+            timeout: seconds for each call, None for no deadline; if left out, the client's.
+
+        Raises:
+            ParameterError: a parameter is not declared.
+        """
+        wanted = _all_of(names)
+        return _one_or_all(names, self._known(wanted, await self._types(wanted, timeout)))
+
+    async def list(self, *prefixes: str, depth: int = 0, timeout: Timeout = ...) -> Names:
+        """Return the sorted names of the node's parameters.
+
+        Args:
+            prefixes: only names that begin with one of these and a dot, or that are one of them.
+            depth: the maximum number of parts of a name, after its prefix; 0 for any.
+            timeout: seconds, None for no deadline; if left out, the client's.
+        """
+        request = {"prefixes": [*prefixes], "depth": depth}
+        response = await self._call("ListParameters", request, timeout)
+        return sorted(response.result.names)
+
+    @overload
+    async def set(self, name: str, value: object, /, *, timeout: Timeout = ...) -> None: ...
+
+    @overload
+    async def set(self, values: Mapping[str, object], /, *, timeout: Timeout = ...) -> None: ...
+
+    async def set(
+        self, name: str | Mapping[str, object], value: object = ..., /, *, timeout: Timeout = ...
+    ) -> None:
+        """Set a parameter, ``set("speed", 0.5)``, or several, ``set({"speed": 0.5, "on": True})``.
+
+        Each is set on its own: if one is refused, the others are set. None undeclares a parameter,
+        if the node allows that.
+
+        Args:
+            name: the parameter's name; or a mapping of names to values.
+            value: the value, if a name is given.
+            timeout: seconds for each call, None for no deadline; if left out, the client's.
+
+        Raises:
+            ParameterError: the node refused one or more of them; it has the reason of each.
+            TypeError: a value is of a type that no parameter has; nothing was set.
+            ValueError: a value is out of range; nothing was set.
+        """
+        values = _assignments(name, value)
+        request = await self._request(values, timeout)
+        results = (await self._call("SetParameters", request, timeout)).results
+        self._check({n: r for n, r in zip(values, results, strict=True) if not r.successful})
+
+    async def set_atomically(
+        self, values: Mapping[str, object], /, *, timeout: Timeout = ...
+    ) -> None:
+        """Set several parameters at once: all of them, or none.
+
+        Args:
+            values: the values by the parameters' names.
+            timeout: seconds for each call, None for no deadline; if left out, the client's.
+
+        Raises:
+            ParameterError: the node refused them, and none was set. ROS does not say which of them
+                is the cause, so all have the same reason.
+            TypeError: a value is of a type that no parameter has; nothing was set.
+            ValueError: a value is out of range; nothing was set.
+        """
+        request = await self._request(values, timeout)
+        result = (await self._call("SetParametersAtomically", request, timeout)).result
+        if not result.successful:
+            self._check(dict.fromkeys(values, result))
+
+    async def load(
+        self,
+        file: str | os.PathLike[str],
+        *,
+        use_wildcard: bool = False,
+        timeout: Timeout = ...,
+    ) -> dict[str, Any]:
+        """Set the parameters that a YAML file has for this node, as ``ros2 param load`` does.
+
+        Each is set on its own: if one is refused, the others are set. One that is refused and has
+        the file's value already, such as a read-only parameter, is no error.
+
+        Args:
+            file: the file's path.
+            use_wildcard: whether to use the entries whose node name has wildcards, such as
+                ``/**``. The entry of the node itself comes first.
+            timeout: seconds for each call, None for no deadline; if left out, the client's.
+
+        Returns:
+            The values by the parameters' names.
+
+        Raises:
+            ImportError: PyYAML is not installed; the message says how to install it.
+            OSError: the file cannot be read.
+            ValueError: it is not a parameter file, or has no parameters for this node.
+            ParameterError, TypeError: as for `set`.
+        """
+        text = await anyio.Path(file).read_text(encoding="utf-8")
+        values = _parse(os.fspath(file), text, self._node_name, use_wildcard)
+        try:
+            await self.set(values, timeout=timeout)
+        except ParameterError as error:
+            current = await self._ask("GetParameters", "values", [*error.reasons], timeout)
+            same = {name for name in current if _from_ros(current[name]) == values[name]}
+            reasons = {name: error.reasons[name] for name in error.reasons if name not in same}
+            if reasons:
+                raise self._error(reasons) from None
+        return values
+
+    async def dump(self, *, timeout: Timeout = ...) -> str:
+        """Return the node's parameters as YAML, as ``ros2 param dump`` prints them.
+
+        Parameters without a value are left out.
+
+        Args:
+            timeout: seconds for each call, None for no deadline; if left out, the client's.
+
+        Raises:
+            ImportError: PyYAML is not installed; the message says how to install it.
+        """
+        yaml = _import_yaml()
+        names = await self.list(timeout=timeout)
+        found = await self._ask("GetParameters", "values", names, timeout)
+        tree = _nested((name, _to_yaml(_from_ros(value))) for name, value in found.items())
+        document = {self._node_name: {"ros__parameters": tree}}
+        text: str = yaml.safe_dump(document, default_flow_style=False)
+        return text
+
+    async def _call(self, service: str, request: Mapping[str, Any], timeout: Timeout) -> Any:
+        name = re.sub("(?<=[a-z])([A-Z])", r"_\1", service).lower()
+        return await self._session.call(
+            f"rcl_interfaces/srv/{service}",
+            f"{self._node_name}/{name}",
+            request,
+            timeout=self._timeout if timeout is ... else timeout,
+        )
+
+    async def _ask_all(
+        self, service: str, field: str, names: str | Several, timeout: Timeout
+    ) -> dict[str, Any]:
+        """As `_ask`, but all the names must be known."""
+        wanted = _all_of(names)
+        return self._known(wanted, await self._ask(service, field, wanted, timeout))
+
+    def _known(self, names: Iterable[str], found: dict[str, Any]) -> dict[str, Any]:
+        missing = [name for name in names if name not in found]
+        if missing:
+            raise self._error(dict.fromkeys(missing, NOT_DECLARED))
+        return found
+
+    async def _types(self, names: Sequence[str], timeout: Timeout) -> dict[str, ParameterType]:
+        """Return the types of those that are declared."""
+        if not names:
+            return {}
+        # An rclpy node that allows undeclared parameters raises an exception, and ends, if it is
+        # asked for the type of one.
+        declared = {*await self.list(*names, timeout=timeout)}
+        known = [name for name in names if name in declared]
+        found = await self._ask("GetParameterTypes", "types", known, timeout)
+        return {name: ParameterType(number) for name, number in found.items()}
+
+    async def _ask(
+        self, service: str, field: str, names: Sequence[str], timeout: Timeout
+    ) -> dict[str, Any]:
+        """Return what the node says about each name that it knows."""
+        if not names:
+            return {}
+        answers = getattr(await self._call(service, {"names": names}, timeout), field)
+        if len(answers) == len(names):
+            return dict(zip(names, answers, strict=True))
+        # A node does not say which of the names it does not know.
+        if len(names) == 1:
+            return {}
+        half = len(names) // 2
+        known = await self._ask(service, field, names[:half], timeout)
+        return known | await self._ask(service, field, names[half:], timeout)
+
+    async def _request(self, values: Mapping[str, object], timeout: Timeout) -> dict[str, Any]:
+        """Return the request that sets these values."""
+        typed = {name: _typed(name, value) for name, value in values.items()}
+        empty = [name for name, (kind, _) in typed.items() if kind is None]
+        kinds = await self._types(empty, timeout)
+        for name in empty:
+            typed[name] = self._array_type(name, kinds.get(name)), typed[name][1]
+        return {
+            "parameters": [
+                {"name": name, "value": _to_ros(kind, value)}
+                for name, (kind, value) in typed.items()
+            ]
+        }
+
+    def _array_type(self, name: str, kind: ParameterType | None) -> ParameterType:
+        if kind is not None and kind.is_array:
+            return kind
+        raise TypeError(
+            f"{name!r}: the type of an empty list is unknown, because {self._node_name} has no "
+            "array of this name: give a list that is not empty, or b'' for a byte array"
+        )
+
+    def _check(self, refused: Mapping[str, Any]) -> None:
+        if refused:
+            raise self._error(
+                {name: result.reason or "no reason given" for name, result in refused.items()}
+            )
+
+    def _error(self, reasons: Mapping[str, str]) -> ParameterError:
+        by_reason: dict[str, list[str]] = {}
+        for name, reason in reasons.items():
+            by_reason.setdefault(reason, []).append(repr(name))
+        details = "; ".join(f"{', '.join(names)}: {reason}" for reason, names in by_reason.items())
+        return ParameterError(
+            f"{self._node_name}: {details}", node_name=self._node_name, reasons=reasons
+        )
+
+
+def _all_of(names: str | Several) -> list[str]:
+    return [names] if isinstance(names, str) else [*names]
+
+
+def _one_or_all(names: str | Several, found: dict[str, Any]) -> Any:
+    return found[names] if isinstance(names, str) else found
+
+
+def _assignments(name: str | Mapping[str, object], value: object) -> Mapping[str, object]:
+    if isinstance(name, str) and value is not ...:
+        return {name: value}
+    if isinstance(name, Mapping) and value is ...:
+        return name
+    raise TypeError('give a name and a value, set("speed", 0.5), or a mapping: set({"speed": 0.5})')
+
+
+# Values
+
+
+def _typed(name: str, value: Any) -> tuple[ParameterType | None, Any]:
+    """Return the type of a value, None for an empty list; and the value without NumPy's types."""
+    if hasattr(value, "tolist"):  # NumPy's scalars and arrays, and array.array
+        value = value.tolist()
+    if isinstance(value, bytes | bytearray):
+        return ParameterType.BYTE_ARRAY, bytes(value)
+    if not isinstance(value, Sequence) or isinstance(value, str):
+        kind = _scalar_type(value)
+        if kind is not None:
+            return kind, value
+        raise TypeError(f"{name!r}: no parameter can have a {type(value).__name__}")
+    if not value:
+        return None, []
+    if all(isinstance(item, bytes) and len(item) == 1 for item in value):
+        return ParameterType.BYTE_ARRAY, b"".join(value)
+    return _array_type(name, value), value
+
+
+def _scalar_type(value: object) -> ParameterType | None:
+    if value is None:
+        return ParameterType.NOT_SET
+    if isinstance(value, bool):
+        return ParameterType.BOOL
+    if isinstance(value, numbers.Integral):
+        return ParameterType.INTEGER
+    if isinstance(value, numbers.Real):
+        return ParameterType.DOUBLE
+    return ParameterType.STRING if isinstance(value, str) else None
+
+
+def _array_type(name: str, values: Sequence[Any]) -> ParameterType:
+    kinds = {_scalar_type(value) for value in values}
+    if kinds == {ParameterType.INTEGER, ParameterType.DOUBLE}:
+        return ParameterType.DOUBLE_ARRAY
+    kind = kinds.pop()
+    if kinds or kind not in ARRAY_OF:
+        raise TypeError(
+            f"{name!r}: the elements of a list must all be bool, int, float, str or single bytes"
+        )
+    return ARRAY_OF[kind]
+
+
+def _to_ros(kind: ParameterType | None, value: Any) -> dict[str, Any]:
+    assert kind is not None
+    return {"type": kind} if kind is ParameterType.NOT_SET else {"type": kind, kind.field: value}
+
+
+def _from_ros(value: Any) -> Any:
+    kind = ParameterType(value.type)
+    return None if kind is ParameterType.NOT_SET else to_dict(value)[kind.field]
+
+
+def _descriptor(message: Any) -> ParameterDescriptor:
+    ranges = [*message.floating_point_range, *message.integer_range]
+    return ParameterDescriptor(
+        name=message.name,
+        type=ParameterType(message.type),
+        description=message.description,
+        constraints=message.additional_constraints,
+        read_only=message.read_only,
+        dynamic_typing=message.dynamic_typing,
+        range=next((ParameterRange(r.from_value, r.to_value, r.step) for r in ranges), None),
+    )
+
+
+# Files
+
+
+def _import_yaml() -> Any:
+    try:
+        import yaml
+    except ImportError as error:
+        raise ImportError(
+            f"parameter files need PyYAML, which cannot be imported here ({error}): "
+            "pip install 'rosasync[cli]'"
+        ) from error
+    return yaml
+
+
+def _to_yaml(value: Any) -> Any:
+    """Write a byte array as ``ros2 param dump`` does: as a list of single bytes."""
+    return [bytes((byte,)) for byte in value] if isinstance(value, bytes) else value
+
+
+def _nested(values: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+    """Return nested dicts for sorted names with dots."""
+    root: dict[str, Any] = {}
+    for name, value in values:
+        if value is not None:
+            _insert(root, name, value)
+    return root
+
+
+def _insert(tree: dict[str, Any], name: str, value: Any) -> None:
+    first, dot, rest = name.partition(".")
+    inner = tree.setdefault(first, {}) if dot else None
+    if isinstance(inner, dict):
+        _insert(inner, rest, value)
+    else:
+        # It has no dot, or its first part is itself a parameter.
+        tree[name] = value
+
+
+def _flat(prefix: str, tree: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    for key, value in tree.items():
+        if isinstance(value, Mapping):
+            yield from _flat(f"{prefix}{key}.", value)
+        else:
+            yield f"{prefix}{key}", value
+
+
+def _parse(file: str, text: str, node_name: str, use_wildcard: bool) -> dict[str, Any]:
+    """Return the parameters that a file has for a node."""
+    yaml = _import_yaml()
+    try:
+        document = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ValueError(f"{file} is not YAML: {error}") from error
+    entries = [*_entries("", document)] if isinstance(document, Mapping) else []
+    if not entries:
+        raise ValueError(f"{file} is not a parameter file: no node in it has ros__parameters")
+    patterns = [tree for name, tree in entries if "*" in name and _matches(name, node_name)]
+    own = [tree for name, tree in entries if name == node_name]
+    chosen = [*patterns, *own] if use_wildcard else own
+    if not chosen:
+        names = ", ".join(dict.fromkeys(name for name, _ in entries))
+        hint = "; use_wildcard uses the wildcards" if patterns else ""
+        raise ValueError(f"{file} has no parameters for {node_name}, only for {names}{hint}")
+    values = {name: _typed(name, value)[1] for tree in chosen for name, value in _flat("", tree)}
+    empty = [name for name, value in values.items() if value is None]
+    if empty:
+        raise ValueError(f"{file} has no value for {', '.join(empty)}")
+    return values
+
+
+def _entries(namespace: str, tree: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """Yield each node's name, or pattern, with its parameters."""
+    for key, inner in tree.items():
+        if not isinstance(inner, Mapping):
+            continue
+        if key == "ros__parameters":
+            yield namespace or "/", inner
+        else:
+            yield from _entries(f"{namespace}/{str(key).strip('/')}", inner)
+
+
+def _matches(pattern: str, node_name: str) -> bool:
+    """Return whether a name matches: ``*`` is any one part of it, ``**`` any number of parts."""
+    wild = {"**": "(/[^/]+)*", "*": "/[^/]+"}
+    parts = (wild.get(part, "/" + re.escape(part)) for part in pattern.split("/")[1:])
+    return re.fullmatch("".join(parts), node_name) is not None

@@ -1,0 +1,239 @@
+"""Lifecycle nodes of stock rclpy in another process."""
+
+from __future__ import annotations
+
+import asyncio
+import copy
+import pickle
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager
+from typing import Any
+
+import pytest
+
+import rosasync
+from rosasync import ServiceCall, ServiceServer, Session
+from rosasync.lifecycle import (
+    LifecycleClient,
+    LifecycleState,
+    TransitionError,
+    TransitionFailed,
+    TransitionTimeout,
+)
+from tests.support.managed import NodesProcess
+from tests.support.times import LIMIT, TICK, until
+
+CHANGE = "lifecycle_msgs/srv/ChangeState"
+STATE = "lifecycle_msgs/srv/GetState"
+SOON = 4 * TICK
+AWHILE = 30 * TICK
+"""Long enough for a call that is answered."""
+
+
+@pytest.fixture(scope="module")
+def nodes() -> Iterator[NodesProcess]:
+    """A process of stock nodes, for all tests of this module."""
+    with NodesProcess() as nodes:
+        yield nodes
+
+
+async def test_all_transitions(session: Session, nodes: NodesProcess) -> None:
+    node = LifecycleClient(session, await nodes.add("lifecycle"))
+    assert await node.state() is LifecycleState.UNCONFIGURED
+    assert await node.configure() == await node.state() == "inactive"
+    assert await node.activate() == await node.state() == "active"
+    assert await node.deactivate() == await node.state() == "inactive"
+    assert await node.cleanup() == await node.state() == "unconfigured"
+    assert await node.shutdown() == await node.state() == "finalized"
+
+
+@pytest.mark.parametrize("steps", [(), ("configure",), ("configure", "activate")])
+async def test_shutdown_from_each_state(
+    session: Session, nodes: NodesProcess, steps: tuple[str, ...]
+) -> None:
+    node = LifecycleClient(session, await nodes.add("lifecycle"))
+    for step in steps:
+        await getattr(node, step)()
+    assert await node.shutdown() is LifecycleState.FINALIZED
+    with pytest.raises(TransitionFailed, match="it is finalized, and shutdown starts from"):
+        await node.shutdown()
+
+
+async def test_the_transitions_that_a_state_allows(session: Session, nodes: NodesProcess) -> None:
+    node = LifecycleClient(session, await nodes.add("lifecycle"))
+    found = {transition.label: transition for transition in await node.transitions()}
+    assert {*found} == {"configure", "shutdown"}
+    assert found["configure"].id == 1
+    assert found["configure"].start is LifecycleState.UNCONFIGURED
+    assert found["configure"].goal is LifecycleState.CONFIGURING
+    await node.configure()
+    labels = {transition.label for transition in await node.transitions()}
+    assert labels == {"activate", "cleanup", "shutdown"}
+
+
+async def test_one_that_the_state_does_not_allow(session: Session, nodes: NodesProcess) -> None:
+    node = LifecycleClient(session, await nodes.add("lifecycle"))
+    with pytest.raises(TransitionFailed, match="it is unconfigured, and activate starts from") as e:
+        await node.activate()
+    assert (e.value.node_name, e.value.transition) == (node.node_name, "activate")
+    assert e.value.state is LifecycleState.UNCONFIGURED
+    # The node has survived the question.
+    assert await node.configure() == "inactive"
+
+
+@pytest.mark.parametrize(
+    ("kind", "steps", "state"),
+    [
+        ("failing", ("configure",), "unconfigured"),
+        ("recovering", ("configure", "activate"), "unconfigured"),
+        ("broken", ("configure",), "finalized"),
+    ],
+)
+async def test_one_that_fails_or_raises(
+    session: Session, nodes: NodesProcess, kind: str, steps: tuple[str, ...], state: str
+) -> None:
+    node = LifecycleClient(session, await nodes.add(kind))
+    *before, last = steps
+    for step in before:
+        await getattr(node, step)()
+    with pytest.raises(TransitionFailed, match=f"{node.node_name}: {last}: .* it is {state}") as e:
+        await getattr(node, last)()
+    assert e.value.state == state == await node.state()
+
+
+class TestTimeouts:
+    async def test_done_if_the_node_answers_after_all(
+        self, session: Session, nodes: NodesProcess
+    ) -> None:
+        node = LifecycleClient(session, await nodes.add("slow"))
+        await session.wait_for_service(CHANGE, f"{node.node_name}/change_state", timeout=LIMIT)
+        transition = asyncio.create_task(node.configure(timeout=AWHILE))
+        await nodes.held()
+        # The node answers nothing while it configures. It is asked for its state when the
+        # transition has timed out, and answers when it has finished.
+        await until(lambda: in_flight(session, f"{node.node_name}/get_state"))
+        await nodes.release()
+        assert await transition is LifecycleState.INACTIVE
+
+    async def test_unknown_if_the_node_is_silent(
+        self, session: Session, nodes: NodesProcess
+    ) -> None:
+        node = LifecycleClient(session, await nodes.add("slow"))
+        await session.wait_for_service(CHANGE, f"{node.node_name}/change_state", timeout=LIMIT)
+        with pytest.raises(TransitionTimeout, match="state could not be read either") as caught:
+            await node.configure(timeout=SOON)
+        assert caught.value.state is None
+        assert caught.value.outcome == "unknown"
+        assert isinstance(caught.value.__cause__, rosasync.ResponseTimeout)
+        await nodes.held()
+        await nodes.release()
+        assert await node.state() == "inactive"
+
+    async def test_unknown_if_it_still_configures(
+        self, session: Session, nodes: NodesProcess
+    ) -> None:
+        node = LifecycleClient(session, await nodes.add("slow_and_talking"))
+        await session.wait_for_service(CHANGE, f"{node.node_name}/change_state", timeout=LIMIT)
+        with pytest.raises(TransitionTimeout, match="the node is configuring") as caught:
+            await node.configure(timeout=AWHILE)
+        assert caught.value.state is LifecycleState.CONFIGURING
+        assert caught.value.outcome == "unknown"
+        await nodes.release()
+
+    @pytest.mark.parametrize(
+        ("number", "outcome"), [(1, "not done"), (3, "not done"), (15, "unknown"), (99, "unknown")]
+    )
+    async def test_by_the_state_of_a_node_that_does_not_answer(
+        self, session: Session, number: int, outcome: str
+    ) -> None:
+        async with never_changing(session, number):
+            with pytest.raises(TransitionTimeout, match="/stuck: configure: not answered") as e:
+                await LifecycleClient(session, "/stuck").configure(timeout=AWHILE)
+            assert e.value.outcome == outcome
+
+    async def test_done_by_the_state_of_a_node_that_does_not_answer(self, session: Session) -> None:
+        async with never_changing(session, 2):
+            assert await LifecycleClient(session, "/stuck").configure(timeout=AWHILE) == "inactive"
+
+
+@pytest.mark.parametrize(
+    ("label", "state", "number"),
+    [("activate", 2, 3), ("shutdown", 1, 5), ("shutdown", 2, 6), ("shutdown", 3, 7)],
+)
+async def test_number_and_label_name_the_same_transition(
+    session: Session, label: str, state: int, number: int
+) -> None:
+    """Stock nodes read the label, micro-ROS reads the number."""
+    asked: list[tuple[int, str]] = []
+
+    def change(request: Any, response: Any) -> Any:
+        asked.append((request.transition.id, request.transition.label))
+        response.success = True
+        return response
+
+    async with (
+        session.serve(CHANGE, "/tiny/change_state", change),
+        telling(session, "/tiny", state),
+    ):
+        await getattr(LifecycleClient(session, "/tiny"), label)()
+    assert asked == [(number, label)]
+
+
+async def test_a_node_without_a_lifecycle(session: Session, nodes: NodesProcess) -> None:
+    node = LifecycleClient(session, await nodes.add("no_services"), timeout=SOON)
+    for ask in (node.state, node.transitions, node.configure, node.shutdown):
+        with pytest.raises(rosasync.ServiceUnavailable):
+            await ask()
+
+
+async def test_many_nodes_at_a_time(session: Session, nodes: NodesProcess) -> None:
+    clients = [LifecycleClient(session, await nodes.add("lifecycle")) for _ in range(5)]
+    assert await asyncio.gather(*(c.configure() for c in clients)) == ["inactive"] * 5
+    assert await asyncio.gather(*(c.activate() for c in clients)) == ["active"] * 5
+
+
+async def test_names_and_timeouts(session: Session) -> None:
+    assert LifecycleClient(session, "arm").node_name == "/arm"
+    assert repr(LifecycleClient(session, "/a/b")) == "<LifecycleClient /a/b>"
+    with pytest.raises(rosasync.InvalidServiceName):
+        LifecycleClient(session, "/no spaces")
+    with pytest.raises(ValueError, match="timeout"):
+        LifecycleClient(session, "/arm", timeout=-1.0)
+
+
+@pytest.mark.parametrize("kind", [TransitionError, TransitionFailed, TransitionTimeout])
+def test_the_errors_are_copied_and_pickled(kind: type[TransitionError]) -> None:
+    error = kind("no", node_name="/a", transition="cleanup", state=LifecycleState.ACTIVE)
+    for twin in (copy.copy(error), pickle.loads(pickle.dumps(error))):
+        assert type(twin) is kind
+        assert (str(twin), twin.node_name, twin.transition) == ("no", "/a", "cleanup")
+        assert twin.state is LifecycleState.ACTIVE
+
+
+def in_flight(session: Session, name: str) -> bool:
+    keys = session.pool.statistics().keys
+    return any(key.srv_name == name and one.in_flight for key, one in keys.items())
+
+
+def telling(session: Session, name: str, state: int) -> ServiceServer[Any, Any]:
+    """Serve the state of a node."""
+
+    def read(request: Any, response: Any) -> Any:
+        response.current_state.id = state
+        return response
+
+    return session.serve(STATE, f"{name}/get_state", read)
+
+
+@asynccontextmanager
+async def never_changing(session: Session, state: int) -> AsyncIterator[None]:
+    """Serve a node that never answers to a transition, and says that it is in this state."""
+    calls: list[ServiceCall[Any, Any]] = []
+    async with (
+        session.serve(CHANGE, "/stuck/change_state", calls.append),
+        telling(session, "/stuck", state),
+    ):
+        await session.wait_for_service(CHANGE, "/stuck/change_state", timeout=LIMIT)
+        yield
+        for call in calls:
+            call.respond(call.response)
