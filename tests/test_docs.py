@@ -75,7 +75,9 @@ class Reader:
         for command, expected in commands(example.parsed):
             words, _, remark = command.partition("  # ")
             program = words.removeprefix("python ")
-            assert program.endswith(".py"), command
+            if not program.endswith(".py"):
+                shell(words, self.folder)
+                continue
             self.run_programs.add(program)
             if program in SERVERS:
                 self.environment = self.servers.start(program)
@@ -145,6 +147,19 @@ def until_terminated(program: Path, expected: str) -> Iterator[None]:
         rest = process.stdout.read()
     assert first + rest == expected
     assert process.returncode == 0
+
+
+def shell(command: str, folder: Path) -> None:
+    """Run any other command of a page, with the folder as home, and the commands of this Python."""
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    rosasync_command = f'rosasync() {{ "{sys.executable}" -m rosasync "$@"; }}; '
+    subprocess.run(
+        ("bash", "-c", rosasync_command + command),
+        cwd=folder,
+        env=os.environ | {"HOME": str(folder), "PATH": path},
+        timeout=120,
+        check=True,
+    )
 
 
 def run(program: Path, environment: Mapping[str, str]) -> str:
