@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.allocations import allocation_rows
 from benchmarks.contestants import CONTESTANTS
-from benchmarks.figures import METRICS
+from benchmarks.figures import METRICS, figure
 from benchmarks.pages import markdown_table, marked_sections
 from benchmarks.results import Results, Turn
 from benchmarks.tables import describe, rows
@@ -24,6 +24,9 @@ __all__ = ["write_plots", "write_report"]
 
 POINTS = 400
 """Points of a curve: accurate enough, and the plots stay small."""
+
+FEATURED = ("direct", "direct-uvloop", "executor", "call", "call-multi", "to-thread", "floor")
+"""The contestants of a plot that would show more than these. The tables have all of them."""
 
 INTRODUCTION = """\
 # Benchmarks
@@ -65,7 +68,7 @@ def write_report(results: Results, out: Path) -> Path:
 
 
 def write_plots(results: Results, folder: Path) -> dict[str, Path]:
-    """Draw the turns of each scenario as PNG and SVG; return the SVG of each with turns."""
+    """Draw the turns of each scenario as SVG; return the file of each with turns."""
     matplotlib.use("agg")
     matplotlib.rcParams["svg.hashsalt"] = "rosasync"
     folder.mkdir(parents=True, exist_ok=True)
@@ -78,30 +81,36 @@ def write_plots(results: Results, folder: Path) -> dict[str, Path]:
         contestants = {key: turns for key, turns in contestants.items() if turns}
         if not contestants:
             continue
-        figure = _draw(scenario, settings["metric"], contestants)
+        drawing = _draw(scenario, settings["metric"], _shown(contestants, settings["metric"]))
         path = folder / (re.sub(r"\W+", "-", scenario) + ".svg")
-        figure.savefig(path, metadata={"Date": None})
-        figure.savefig(path.with_suffix(".png"), dpi=120)
+        drawing.savefig(path, metadata={"Date": None})
         plots[scenario] = path
     return plots
+
+
+def _shown(contestants: dict[str, list[Turn]], metric: str) -> dict[str, list[Turn]]:
+    """Choose few contestants for a plot, and sort them by the metric, the smallest first."""
+    if len(contestants) > len(FEATURED):
+        contestants = {key: turns for key, turns in contestants.items() if key in FEATURED}
+    return dict(sorted(contestants.items(), key=lambda item: figure(item[1], metric) or 0.0))
 
 
 def _draw(scenario: str, metric: str, contestants: dict[str, list[Turn]]) -> Figure:
     height = 1.6 + 0.34 * len(contestants)
     sampled = any(turn.samples for turns in contestants.values() for turn in turns)
-    figure = Figure(figsize=(11, height if not sampled else max(height, 4.5)), layout="tight")
+    drawing = Figure(figsize=(11, height if not sampled else max(height, 4.5)), layout="tight")
     if metric == "median" or not sampled:
-        axes = list(figure.subplots(1, 2 if sampled else 1, squeeze=False)[0])
+        axes = list(drawing.subplots(1, 2 if sampled else 1, squeeze=False)[0])
     else:
-        axes = list(figure.subplots(1, 3)[:])
+        axes = list(drawing.subplots(1, 3)[:])
         _rounds(axes.pop(), metric, contestants)
     if sampled:
         _spread(axes[0], contestants)
         _exceeding(axes[1], contestants)
     else:
         _rounds(axes[0], metric, contestants)
-    figure.suptitle(_title(scenario))
-    return figure
+    drawing.suptitle(_title(scenario))
+    return drawing
 
 
 def _spread(axes: Axes, contestants: dict[str, list[Turn]]) -> None:
@@ -140,14 +149,14 @@ def _exceeding(axes: Axes, contestants: dict[str, list[Turn]]) -> None:
 
 def _rounds(axes: Axes, metric: str, contestants: dict[str, list[Turn]]) -> None:
     """Draw one dot for each round."""
-    figure = METRICS[metric]
+    shown = METRICS[metric]
     for i, turns in enumerate(contestants.values()):
-        values = [value for turn in turns if (value := figure.of(turn)) is not None]
+        values = [value for turn in turns if (value := shown.of(turn)) is not None]
         axes.plot(values, [i + 1] * len(values), "o", alpha=0.7, color=_color(i))
     _name_rows(axes, contestants)
     axes.set_xlim(left=min(0.0, axes.get_xlim()[0]))
     axes.locator_params(axis="x", nbins=4)
-    axes.set_xlabel(f"{figure.label}, a dot for each round")
+    axes.set_xlabel(f"{shown.label}, a dot for each round")
 
 
 def _name_rows(axes: Axes, contestants: Iterable[str]) -> None:

@@ -151,7 +151,8 @@ class Portal:
         `Session.call`. Wrong arguments raise here, everything later is raised by the future.
 
         Raises:
-            UsageError: on the loop's thread, or the executor's.
+            UsageError: on the loop's thread, or the executor's. Use an `AsyncServiceProxy` or
+                ``asyncio.run_coroutine_threadsafe`` there.
             SessionClosed: the session is closed.
         """
         submission = self._submission(
@@ -188,7 +189,9 @@ class Portal:
             )
         if self._node.executor_thread == threading.get_ident():
             raise UsageError(
-                "session.from_thread would block the executor's thread, which runs this callback"
+                "session.from_thread would block the executor's thread, which runs this callback: "
+                "use asyncio.run_coroutine_threadsafe(session.call(…), loop) or an "
+                "AsyncServiceProxy"
             )
 
 

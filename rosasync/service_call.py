@@ -120,7 +120,7 @@ class ServiceCall(Generic[RequestT, ResponseT]):
 
     @property
     def response(self) -> ResponseT:
-        """A response to fill: created at the first access, the same one afterwards."""
+        """A response to fill. It is created at the first access, and the same one afterwards."""
         if self._response is None:
             self._response = self._sender.response_type()
         return self._response

@@ -148,7 +148,7 @@ class Session:
 
     @property
     def bridge(self) -> str:
-        """The bridge in use: ``"direct"`` or ``"executor"``."""
+        """The bridge in use, ``"direct"`` or ``"executor"``."""
         return self.core.node.bridge
 
     @property

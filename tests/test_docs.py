@@ -1,58 +1,280 @@
-"""The programs of the documentation, run unchanged against its lamp."""
+"""The pages of the documentation, followed literally: programs are saved and run as written.
+
+`docs/contributing.md` says what the blocks of a page mean.
+"""
 
 from __future__ import annotations
 
+import ast
+import importlib
+import os
+import re
+import shlex
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
+from sybil import Example, Sybil
+from sybil.parsers.markdown import CodeBlockParser
 
-from tests.support.servers import running
+import rosasync
+from rosasync.ros.domain import isolate
+from tests.support.process import ROOT, profile
+from tests.support.times import LIMIT
 
-EXAMPLES = Path(__file__).parent.parent / "docs" / "examples"
+DOCS = ROOT / "docs"
+NAME = re.compile(r"# (\S+\.py)\n")
+SERVERS = {"lamp.py": DOCS / "tutorial.md", "robot.py": DOCS / "how-to" / "ticks.md"}
+"""The programs that more than one page runs, and the page that shows them."""
 
-PRINTS = {
-    "at_once": "on: 50 off: 50\n",
-    "borrowed_node": "the lamp is on\nthe executor's task returned /mine\n",
-    "by_name": "the lamp is off\n",
-    "exclusive": "the lamp is on\nthe lamp is off\n1 client, 2 calls\n",
-    "first_call": "the lamp is on\n",
-    "serve": "the lamp is off\n",
+HANDLES: dict[str, type] = {
+    "session": rosasync.Session,
+    "server": rosasync.ServiceServer,
+    "call": rosasync.ServiceCall,
+    "proxy": rosasync.AsyncServiceProxy,
+    "rosasync": type(rosasync),
 }
+"""What fragments call an object, and its class."""
 
 
-@pytest.fixture(scope="module")
-def lamp() -> Iterator[None]:
-    with running(EXAMPLES / "lamp.py"):
+def pages() -> list[Path]:
+    """Return every page with a console block, and the README."""
+    found = [path for path in DOCS.rglob("*.md") if "console\n$" in path.read_text()]
+    return [*sorted(found), ROOT / "README.md"]
+
+
+class Reader:
+    """Follows one page in an empty folder: saves its programs and runs its commands."""
+
+    def __init__(self, folder: Path, servers: Servers) -> None:
+        self.folder = folder
+        self.servers = servers
+        self.programs: list[str] = []
+        self.run_programs: set[str] = set()
+        self.background = ExitStack()
+        self.environment: dict[str, str] = {}
+
+    def follow(self, page: Path) -> None:
+        sybil = Sybil(
+            [CodeBlockParser("python", self.python), CodeBlockParser("console", self.console)]
+        )
+        with self.background:
+            for example in sybil.parse(page).examples():
+                example.evaluate()
+
+    def python(self, example: Example) -> None:
+        if name := NAME.match(example.parsed):
+            (self.folder / name[1]).write_text(example.parsed)
+            self.programs.append(name[1])
+
+    def console(self, example: Example) -> None:
+        for command, expected in commands(example.parsed):
+            words, _, remark = command.partition("  # ")
+            program = words.removeprefix("python ")
+            if not program.endswith(".py"):
+                shell(words, self.folder)
+                continue
+            self.run_programs.add(program)
+            if program in SERVERS:
+                self.environment = self.servers.start(program)
+            elif "second terminal" in remark:
+                self.background.enter_context(until_terminated(self.folder / program, expected))
+            else:
+                printed = run(self.folder / program, self.environment)
+                if order := re.search(r"lines (\d+) to (\d+) in any order", remark):
+                    part = slice(int(order[1]) - 1, int(order[2]))
+                    printed = with_sorted(printed, part)
+                    expected = with_sorted(expected, part)
+                assert matches(printed, expected), f"{command} printed:\n{printed}"
+
+
+class Servers:
+    """The stock servers that the pages share, each started when a page first needs it."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._environments: dict[str, dict[str, str]] = {}
+        self._stack = ExitStack()
+
+    def start(self, program: str) -> dict[str, str]:
+        """Start a server in a ROS domain of its own; return the environment of its clients."""
+        if program not in self._environments:
+            path = self._folder / program
+            path.write_text(program_of(SERVERS[program], program))
+            self._environments[program] = environment = another_domain()
+            environment = environment | self._stack.enter_context(profile())
+            process = subprocess.Popen(
+                (sys.executable, str(path)), env=os.environ | environment, stderr=subprocess.DEVNULL
+            )
+            self._stack.callback(end, process)
+        return self._environments[program]
+
+    def close(self) -> None:
+        self._stack.close()
+
+
+def another_domain() -> dict[str, str]:
+    """Claim another ROS domain, so that a page sees its own servers only."""
+    own = os.environ["ROS_DOMAIN_ID"]
+    domain = isolate()
+    os.environ["ROS_DOMAIN_ID"] = own
+    return {"ROS_DOMAIN_ID": str(domain)}
+
+
+def end(process: subprocess.Popen[Any]) -> None:
+    """Terminate a stock node. Its signal handler does not always wake its spin."""
+    process.terminate()
+    try:
+        process.wait(LIMIT / 4)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+@contextmanager
+def until_terminated(program: Path, expected: str) -> Iterator[None]:
+    """Run a program until SIGTERM; check what it prints before and after, and its exit code."""
+    process = subprocess.Popen((sys.executable, str(program)), stdout=subprocess.PIPE, text=True)
+    with process:
+        assert process.stdout is not None
+        first = process.stdout.readline()
         yield
+        process.terminate()
+        rest = process.stdout.read()
+    assert first + rest == expected
+    assert process.returncode == 0
 
 
-def output_of(example: str) -> str:
-    command = (sys.executable, str(EXAMPLES / f"{example}.py"))
+def shell(command: str, folder: Path) -> None:
+    """Run any other command of a page, with the folder as home, and the commands of this Python."""
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    rosasync_command = f'rosasync() {{ "{sys.executable}" -m rosasync "$@"; }}; '
+    subprocess.run(
+        ("bash", "-c", rosasync_command + command),
+        cwd=folder,
+        env=os.environ | {"HOME": str(folder), "PATH": path},
+        timeout=120,
+        check=True,
+    )
+
+
+def run(program: Path, environment: Mapping[str, str]) -> str:
+    """Run a program as the page says, with warnings about unclosed things as errors."""
     return subprocess.run(
-        command, stdout=subprocess.PIPE, text=True, timeout=120, check=True
+        (sys.executable, "-W", "error::ResourceWarning", program.name),
+        cwd=program.parent,
+        env=os.environ | environment,
+        stdout=subprocess.PIPE,
+        text=True,
+        timeout=120,
+        check=True,
     ).stdout
 
 
-@pytest.mark.usefixtures("lamp")
-@pytest.mark.parametrize("example", PRINTS)
-def test_example(example: str) -> None:
-    assert output_of(example) == PRINTS[example]
+def program_of(page: Path, name: str) -> str:
+    """Return the text of a program that a page shows."""
+    return next(code for code in python_blocks(page) if code.startswith(f"# {name}\n"))
 
 
-@pytest.mark.usefixtures("lamp")
-def test_errors_example() -> None:
-    wrong_type, no_server = output_of("errors").splitlines()
-    assert "std_srvs/srv/SetBool" in wrong_type
-    assert no_server.startswith("ServiceUnavailable /lamp/dim")
+def python_blocks(page: Path) -> list[str]:
+    return [
+        str(example.parsed)
+        for example in Sybil([CodeBlockParser("python", lambda _: None)]).parse(page).examples()
+    ]
 
 
-def test_the_readme_shows_the_first_example() -> None:
-    readme = (EXAMPLES.parent.parent / "README.md").read_text()
-    assert f"```python\n{(EXAMPLES / 'first_call.py').read_text()}```" in readme
+def commands(block: str) -> Iterator[tuple[str, str]]:
+    """Split a console block into its commands, each with the output that follows it."""
+    for part in re.split(r"^\$ ", block, flags=re.MULTILINE)[1:]:
+        command, _, output = part.partition("\n")
+        yield command, output
 
 
-def test_every_example_is_run() -> None:
-    assert {path.stem for path in EXAMPLES.glob("*.py")} == {*PRINTS, "errors", "lamp"}
+def matches(printed: str, expected: str) -> bool:
+    """Compare an output with the page, in which ``...`` stands for any text."""
+    pattern = ".*".join(re.escape(part) for part in expected.rstrip("\n").split("..."))
+    return re.fullmatch(pattern, printed.rstrip("\n"), re.DOTALL) is not None
+
+
+def with_sorted(text: str, part: slice) -> str:
+    """Sort some lines of a text."""
+    lines = text.splitlines()
+    lines[part] = sorted(lines[part])
+    return "\n".join(lines)
+
+
+@pytest.fixture(scope="module")
+def servers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Servers]:
+    servers = Servers(tmp_path_factory.mktemp("servers"))
+    yield servers
+    servers.close()
+
+
+@pytest.mark.parametrize("page", pages(), ids=lambda page: page.stem)
+def test_the_page_works_as_written(page: Path, tmp_path: Path, servers: Servers) -> None:
+    reader = Reader(tmp_path, servers)
+    reader.follow(page)
+    imported = {
+        name.removesuffix(".py")
+        for name in reader.programs
+        if any(f"from {name.removesuffix('.py')} import" in code for code in python_blocks(page))
+    }
+    not_run = set(reader.programs) - reader.run_programs
+    assert {name.removesuffix(".py") for name in not_run} <= imported
+
+
+@pytest.mark.parametrize(
+    "page", [*sorted(DOCS.rglob("*.md")), ROOT / "README.md"], ids=lambda page: page.stem
+)
+def test_every_fragment_compiles_and_its_names_exist(page: Path) -> None:
+    for code in python_blocks(page):
+        tree = compile(code, str(page), "exec", ast.PyCF_ONLY_AST | ast.PyCF_ALLOW_TOP_LEVEL_AWAIT)
+        assert isinstance(tree, ast.Module)
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+                owner = HANDLES.get(node.value.id)
+                found = rosasync if node.value.id == "rosasync" else owner
+                assert owner is None or has(found, node.attr), f"{node.value.id}.{node.attr}"
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("rosasync"):
+                module = importlib.import_module(str(node.module))
+                assert all(hasattr(module, alias.name) for alias in node.names)
+
+
+def has(owner: Any, name: str) -> bool:
+    """Return whether an object has an attribute or a submodule of this name."""
+    return hasattr(owner, name) or (
+        owner is rosasync and (Path(str(rosasync.__file__)).parent / f"{name}.py").exists()
+    )
+
+
+def test_the_commands_of_the_readme_are_the_ones_that_are_checked() -> None:
+    blocks = re.findall(r"```bash\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    assert [shlex.split(block)[-2:] for block in blocks] == [
+        [".venv/bin/rosasync", "demo"],
+        ["-n", "4"],
+    ]
+
+
+def test_the_robot_has_a_dozen_services() -> None:
+    robot = program_of(SERVERS["robot.py"], "robot.py")
+    assert len([line for line in robot.splitlines() if '": (' in line]) == 12
+
+
+def test_the_plot_of_the_readme_shows_its_table() -> None:
+    readme = (ROOT / "README.md").read_text()
+    plot = (DOCS / "diagrams" / "benchmark.svg").read_text()
+    rows = [line.split("|") for line in readme.splitlines() if re.match(r"\| .* \| \d", line)]
+    assert len(rows) == 5
+    for _, _, latency, _, rate, *_ in rows:
+        assert f">{latency.strip()}<" in plot
+        assert f">{rate.strip()}<" in plot
+
+
+def test_the_links_of_the_readme_lead_somewhere() -> None:
+    links = re.findall(r"\]\((docs/[^)#]+)", (ROOT / "README.md").read_text())
+    assert len(links) > 10
+    assert not [link for link in links if not (ROOT / link).exists()]

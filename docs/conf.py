@@ -1,0 +1,120 @@
+"""The configuration of the documentation: Sphinx, with pages in MyST Markdown.
+
+Build it with ``sphinx-build -W docs site``.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from docutils import nodes
+from sphinx import addnodes
+from sphinx.application import Sphinx
+from sphinx.transforms import SphinxTransform
+
+import rosasync
+
+project = "rosasync"
+author = "The rosasync authors"
+project_copyright = author
+
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx_copybutton",
+]
+exclude_patterns = ["examples", "site"]
+
+html_theme = "furo"
+html_title = "rosasync"
+html_copy_source = False
+
+myst_heading_anchors = 3
+
+autodoc_default_options = {"members": True, "member-order": "bysource"}
+autodoc_preserve_defaults = True
+autodoc_typehints_format = "short"
+napoleon_google_docstring = True
+napoleon_numpy_docstring = False
+python_maximum_signature_line_length = 88
+toc_object_entries_show_parents = "hide"
+# A name in single backquotes in a docstring links to its entry.
+default_role = "py:obj"
+
+copybutton_prompt_text = "$ "
+copybutton_only_copy_prompt_lines = True
+
+HANDLES = {
+    "session": "Session",
+    "session.pool": "ClientPool",
+    "session.from_thread": "Portal",
+    "server": "ServiceServer",
+    "call": "ServiceCall",
+    "proxy": "AsyncServiceProxy",
+}
+"""What the pages call an object, and its class."""
+
+
+OBTAINED = ("ClientPool", "LeasedClient", "Portal", "ServiceCall", "ServiceClient", "ServiceServer")
+"""Classes that only a session constructs, so their arguments are not shown."""
+
+
+class NamesToReferences(SphinxTransform):
+    """Link the names in the pages' code spans, such as `session.call`, to the reference."""
+
+    default_priority = 500
+
+    def apply(self, **kwargs: Any) -> None:
+        """Wrap each code span that names something public into a reference to it."""
+        for literal in list(self.document.findall(nodes.literal)):
+            target = target_of(literal.astext())
+            if target is None or _is_linked(literal):
+                continue
+            reference = addnodes.pending_xref(
+                "", refdomain="py", reftype="obj", reftarget=target, refdoc=self.env.docname
+            )
+            literal.replace_self(reference)
+            reference += literal
+
+
+def target_of(code: str) -> str | None:
+    """Return the full name of what a code span means, or None if it is not a public name."""
+    name = re.sub(r"\(.*\)$", "", code, flags=re.DOTALL).removeprefix("await ")
+    owner, _, member = name.rpartition(".")
+    if owner in HANDLES and member != "py":
+        return f"rosasync.{HANDLES[owner]}.{member}"
+    name = name.removeprefix("rosasync.")
+    return f"rosasync.{name}" if name.partition(".")[0] in rosasync.__all__ else None
+
+
+def _is_linked(node: nodes.Node) -> bool:
+    inside: Any = node.parent
+    while inside is not None:
+        if isinstance(inside, nodes.title | nodes.reference | addnodes.pending_xref):
+            return True
+        if isinstance(inside, addnodes.desc):
+            return True
+        inside = inside.parent
+    return False
+
+
+def _hide_arguments(
+    app: Sphinx, what: str, name: str, obj: Any, options: Any, signature: str, returns: str
+) -> tuple[str, str] | None:
+    obtained = what == "class" and name.rpartition(".")[2] in OBTAINED
+    return ("", "") if obtained else None
+
+
+def _skip_private(
+    app: Sphinx, what: str, name: str, obj: Any, skip: bool, options: Any
+) -> bool | None:
+    return True if "Not part of the public API" in (obj.__doc__ or "") else None
+
+
+def setup(app: Sphinx) -> None:
+    """Register the transform and the two filters of the reference."""
+    app.add_transform(NamesToReferences)
+    app.connect("autodoc-process-signature", _hide_arguments)
+    app.connect("autodoc-skip-member", _skip_private)
