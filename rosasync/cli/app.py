@@ -30,7 +30,6 @@ _UsageError: Any = typer.BadParameter.__mro__[1]
 app = typer.Typer(
     name="rosasync",
     help="ROS 2 services from the command line.",
-    no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
@@ -54,7 +53,8 @@ app.command()(demo)
 def main() -> int:
     """Run the command line and return the exit code."""
     try:
-        code = app(prog_name="rosasync", standalone_mode=False) or 0
+        arguments = sys.argv[1:] or ["--help"]
+        code = app(arguments, prog_name="rosasync", standalone_mode=False) or 0
         sys.stdout.flush()
     except _UsageError as error:
         fail(_line_of(error))

@@ -27,7 +27,7 @@ def demo(
         bool, typer.Option("--serve", help="Serve what the tutorial calls, until Ctrl-C.")
     ] = False,
 ) -> None:
-    r"""Compare rosasync with rclpy, or serve the tutorial's lamp.
+    """Compare rosasync with rclpy, or serve the tutorial's lamp.
 
     Calls a stock rclpy server with rosasync and with client.call. The server runs in its own
     process, in a ROS domain that nothing else on this machine uses. With --serve, it serves the

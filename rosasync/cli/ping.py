@@ -35,7 +35,7 @@ def ping(
     timeout: Timeout = 5.0,
     as_json: AsJson = False,
 ) -> None:
-    r"""Say how far a call gets, and how long it takes.
+    """Say how far a call gets, and how long it takes.
 
     \b
     graph     a server is visible
