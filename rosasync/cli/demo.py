@@ -58,6 +58,9 @@ async def _serve() -> None:
         print(f"the lamp is {response.message}", flush=True)
         return response
 
-    async with rosasync.Session("lamp") as session, session.serve(LAMP_TYPE, LAMP, switch):
+    async with (
+        rosasync.Session("lamp", introspection="contents") as session,
+        session.serve(LAMP_TYPE, LAMP, switch),
+    ):
         note(f"serving {LAMP} [{LAMP_TYPE}]; call it: rosasync call {LAMP} '{{data: true}}'")
         await asyncio.Event().wait()

@@ -11,6 +11,7 @@ import json
 import math
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import Any
 
 import yaml
@@ -150,11 +151,11 @@ def _fit_text(text: _Plain, field: FieldType) -> Any:
         return word in _TRUE
     if field.kind in ("int", "byte", "float") and _INTEGER.fullmatch(text):
         return int(text, 0) if text.lstrip("+-")[:2].lower() in ("0x", "0o", "0b") else int(text)
+    if field.kind == "float" and word in _FLOATS:
+        return _FLOATS[word]
     if field.kind == "float":
-        try:
-            return _FLOATS.get(word, float(text))
-        except ValueError:
-            return _FLOATS.get(word, str(text))
+        with suppress(ValueError):
+            return float(text)
     return str(text)
 
 

@@ -93,7 +93,7 @@ async def _serve(
     else:
         raise CliError("--handler answers itself: leave out the options of the stub")
     failure: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-    async with open_session() as session:
+    async with open_session(introspection="contents") as session:
         server = _start(session, found, name, _printing(answer, as_json, failure))
         note(f"serving {name} [{srv_type}]; Ctrl-C ends it")
         try:
