@@ -167,6 +167,15 @@ def test_progress_is_drawn_on_a_terminal_only() -> None:
     assert "\x1b" not in rosasync("call", LAMP, ON, "--count", "3").stderr
 
 
+def test_responses_go_to_the_file_while_progress_is_on_the_terminal(tmp_path: Path) -> None:
+    file = tmp_path / "responses"
+    with terminal("call", LAMP, ON, "--count", "3", "--json", into=f"> {file}") as command:
+        assert command.end() == 0
+    assert len(json_lines(file.read_text())) == 4
+    assert b"of 3 calls made" in command.raw
+    assert command.screen == ""
+
+
 def test_a_closed_pipe_ends_it_quietly() -> None:
     command = f"{sys.executable} -m rosasync call {LAMP} --count 100000 --rate 500 --json | head -1"
     done = subprocess.run(

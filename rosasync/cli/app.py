@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import signal
 import sys
 from importlib.metadata import PackageNotFoundError, version
@@ -52,6 +53,8 @@ app.command()(demo)
 
 def main() -> int:
     """Run the command line and return the exit code."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # for terminals without Unicode
     try:
         arguments = sys.argv[1:] or ["--help"]
         code = app(arguments, prog_name="rosasync", standalone_mode=False) or 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -46,10 +47,11 @@ def json_lines(text: str) -> list[Any]:
 class Terminal:
     """A command on a pseudo-terminal."""
 
-    def __init__(self, arguments: tuple[str, ...], environ: dict[str, str]) -> None:
+    def __init__(self, arguments: tuple[str, ...], environ: dict[str, str], into: str) -> None:
+        command = shlex.join((sys.executable, "-m", "rosasync", *arguments))
         self._process = pexpect.spawn(
-            sys.executable,
-            ["-m", "rosasync", *arguments],
+            "bash",
+            ["-c", f"exec {command} {into}"],
             timeout=LIMIT,
             dimensions=(LINES, COLUMNS),
             env={**os.environ, "TERM": "xterm", **environ},
@@ -87,9 +89,15 @@ class Terminal:
 
 
 @contextmanager
-def terminal(*arguments: str, **environ: str) -> Iterator[Terminal]:
-    """Start the command on a pseudo-terminal, and end it with the block."""
-    started = Terminal(arguments, environ)
+def terminal(*arguments: str, into: str = "", **environ: str) -> Iterator[Terminal]:
+    """Start the command on a pseudo-terminal, and end it with the block.
+
+    Args:
+        arguments: what follows ``rosasync``.
+        into: where the shell redirects its output.
+        environ: variables to set.
+    """
+    started = Terminal(arguments, environ, into)
     try:
         yield started
     finally:
