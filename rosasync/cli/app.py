@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import io
+import os
 import signal
 import sys
 from importlib.metadata import PackageNotFoundError, version
@@ -53,8 +53,7 @@ app.command()(demo)
 
 def main() -> int:
     """Run the command line and return the exit code."""
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="replace")  # for terminals without Unicode
+    _keep_stdout()
     try:
         arguments = sys.argv[1:] or ["--help"]
         code = app(arguments, prog_name="rosasync", standalone_mode=False) or 0
@@ -70,6 +69,23 @@ def main() -> int:
     # The interpreter takes some milliseconds to end: a Ctrl-C then prints no traceback.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     return int(code)
+
+
+def _keep_stdout() -> None:
+    """Keep standard output for results: Fast DDS prints its messages there, from C++.
+
+    They go to standard error instead.
+    """
+    if sys.stdout is not sys.__stdout__ or sys.__stdout__ is None:
+        return
+    sys.stdout = open(  # noqa: SIM115 - until the process ends
+        os.dup(1),
+        "w",
+        encoding=sys.__stdout__.encoding,
+        errors="replace",  # for terminals without Unicode
+        buffering=1,
+    )
+    os.dup2(2, 1)
 
 
 def _line_of(error: Any) -> str:

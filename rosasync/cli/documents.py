@@ -23,6 +23,9 @@ __all__ = ["DocumentError", "documents", "dump_json", "dump_yaml", "plain", "rea
 _Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _Dumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
+_UNREADABLE = re.compile(r"[\x7f-\x9f\u2028\u2029\ufeff\ufffe\uffff]")
+"""Characters that JSON allows in a text and YAML does not, or takes for the end of a line."""
+
 _ONE_LINE = 2**31 - 1
 
 _TRUE = {"true", "yes", "on"}
@@ -123,7 +126,8 @@ def dump_yaml(value: object) -> str:
 
 def dump_json(value: object) -> str:
     """Return a value as one line of JSON; NaN and infinity become texts, which are read again."""
-    return json.dumps(_finite(value), ensure_ascii=False, allow_nan=False)
+    text = json.dumps(_finite(value), ensure_ascii=False, allow_nan=False)
+    return _UNREADABLE.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
 
 
 def _fit_fields(values: dict[Any, Any], message_type: type[Any]) -> dict[str, Any]:

@@ -49,7 +49,7 @@ class Terminal:
 
     def __init__(self, arguments: tuple[str, ...], environ: dict[str, str], into: str) -> None:
         command = shlex.join((sys.executable, "-m", "rosasync", *arguments))
-        self._process = pexpect.spawn(
+        self._process: Any = pexpect.spawn(
             "bash",
             ["-c", f"exec {command} {into}"],
             timeout=LIMIT,
