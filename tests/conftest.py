@@ -112,6 +112,20 @@ def server(processes: _Processes) -> Iterator[ServerProcess]:
         server.ask_now("clear")
 
 
+@pytest.fixture(scope="session")
+def lamp() -> Iterator[ServerProcess]:
+    """A process of stock servers for the command line: the tutorial's lamp, and others.
+
+    ``/lamp/silent`` never answers, ``/lamp/text`` echoes, ``/lamp/twice`` has two servers.
+    """
+    with ServerProcess() as server:
+        server.serve_now("/lamp/switch", "std_srvs/srv/SetBool")
+        server.serve_now("/lamp/silent", "std_srvs/srv/SetBool", delay="never")
+        server.serve_now("/lamp/text")
+        server.serve_now("/lamp/twice", "std_srvs/srv/SetBool", copies=2)
+        yield server
+
+
 @pytest.fixture
 def client_process(processes: _Processes) -> ClientProcess:
     """A process of stock clients."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 from importlib.metadata import PackageNotFoundError, version
@@ -32,7 +33,6 @@ _UsageError: Any = typer.BadParameter.__mro__[1]
 app = typer.Typer(
     name="rosasync",
     help="ROS 2 services from the command line.",
-    no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
@@ -58,8 +58,10 @@ app.add_typer(lifecycle.app, name="lifecycle")
 
 def main() -> int:
     """Run the command line and return the exit code."""
+    _keep_stdout()
     try:
-        code = app(prog_name="rosasync", standalone_mode=False) or 0
+        arguments = sys.argv[1:] or ["--help"]
+        code = app(arguments, prog_name="rosasync", standalone_mode=False) or 0
         sys.stdout.flush()
     except _UsageError as error:
         fail(_line_of(error))
@@ -72,6 +74,23 @@ def main() -> int:
     # The interpreter takes some milliseconds to end: a Ctrl-C then prints no traceback.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     return int(code)
+
+
+def _keep_stdout() -> None:
+    """Keep standard output for results: Fast DDS prints its messages there, from C++.
+
+    They go to standard error instead.
+    """
+    if sys.stdout is not sys.__stdout__ or sys.__stdout__ is None:
+        return
+    sys.stdout = open(  # noqa: SIM115 - until the process ends
+        os.dup(1),
+        "w",
+        encoding=sys.__stdout__.encoding,
+        errors="replace",  # for terminals without Unicode
+        buffering=1,
+    )
+    os.dup2(2, 1)
 
 
 def _line_of(error: Any) -> str:

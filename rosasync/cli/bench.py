@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 __all__ = ["bench"]
 
 BINS, BAR = 12, 40
+LATEST = 2000
+"""Calls that the percentiles shown while it runs are of: sorting all would be measured too."""
+
 DISCOVERY = 10.0
 """Seconds to wait for a server."""
 
@@ -43,7 +46,7 @@ def bench(
     ] = 2.0,
     as_json: AsJson = False,
 ) -> None:
-    r"""Put load on a service and measure it.
+    """Put load on a service and measure it.
 
     Shows percentiles and losses while it runs, and a histogram at the end. It makes real calls:
     choose a request that may run often.
@@ -95,7 +98,7 @@ async def _repeat(request: Any, duration: float) -> AsyncIterator[Any]:
 
 def _live(tally: Tally, duration: float) -> str:
     elapsed = time.perf_counter() - tally.started
-    return "\n".join([f"{elapsed:.0f} of {duration:g} s", *tally.lines()])
+    return "\n".join([f"{elapsed:.0f} of {duration:g} s", *tally.lines(LATEST)])
 
 
 def _print(tally: Tally, as_json: bool) -> None:

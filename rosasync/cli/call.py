@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -51,7 +52,7 @@ def call(
         bool, typer.Option("--template", help="Print the request with its defaults, to edit.")
     ] = False,
 ) -> None:
-    r"""Call a service and print its response.
+    """Call a service and print its response.
 
     The type may be left out if the graph knows it. A stream of YAML documents on standard input
     makes a call for each. Several calls end with a summary; with --count the responses themselves
@@ -116,7 +117,11 @@ async def _call(order: _Order, srv_type: str | None) -> int:
         if order.several:
             return await _call_several(session, order, found)
         async for request in order.requests(found):
-            response = await _one(session, order, found, request)
+            try:
+                response = await _one(session, order, found, request)
+            except asyncio.CancelledError:
+                note("interrupted before the response came; the server may still run the request")
+                raise
             _print(response, order)
     return Code.ANSWERED
 
@@ -151,7 +156,8 @@ async def _call_several(session: rosasync.Session, order: _Order, srv_class: Any
                 on_failure=on_failure,
             )
     finally:
-        _summarise(tally, order)
+        if tally.answered or tally.failed:
+            _summarise(tally, order)
     return tally.code
 
 

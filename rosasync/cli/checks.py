@@ -43,7 +43,8 @@ class Report:
             print_json(asdict(made))
             return
         mark, style = {True: ("ok", "green"), False: ("no", "bold red"), None: ("-", "")}[ok]
-        self._console.print(f"{mark:<3}", style=style, end="")
-        self._console.print(f"{check:<15} {found}")
+        from rich.text import Text
+
+        self._console.print(Text.assemble((f"{mark:<3}", style), f"{check:<15} {found}"))
         if made.todo:
-            self._console.print(f"{'':<19}{made.todo}", style="yellow")
+            self._console.print(Text(f"{'':<19}{made.todo}", style="yellow"))

@@ -27,7 +27,7 @@ def demo(
         bool, typer.Option("--serve", help="Serve what the tutorial calls, until Ctrl-C.")
     ] = False,
 ) -> None:
-    r"""Compare rosasync with rclpy, or serve the tutorial's lamp.
+    """Compare rosasync with rclpy, or serve the tutorial's lamp.
 
     Calls a stock rclpy server with rosasync and with client.call. The server runs in its own
     process, in a ROS domain that nothing else on this machine uses. With --serve, it serves the
@@ -58,6 +58,9 @@ async def _serve() -> None:
         print(f"the lamp is {response.message}", flush=True)
         return response
 
-    async with rosasync.Session("lamp") as session, session.serve(LAMP_TYPE, LAMP, switch):
+    async with (
+        rosasync.Session("lamp", introspection="contents") as session,
+        session.serve(LAMP_TYPE, LAMP, switch),
+    ):
         note(f"serving {LAMP} [{LAMP_TYPE}]; call it: rosasync call {LAMP} '{{data: true}}'")
         await asyncio.Event().wait()

@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
+from importlib.metadata import version
 from pathlib import Path
 
 import rosasync
@@ -31,17 +32,15 @@ ENOUGH = 64 << 20
 MULTICAST = "239.255.0.1"
 """The group in which RTPS participants announce themselves (RTPS 2.5, 9.6.1)."""
 
-DISCOVERY = 10.0
+DISCOVERY, SLOW = 10.0, 1.0
 SRV_TYPE = "diagnostic_msgs/srv/AddDiagnostics"
-PROFILES = (
-    "ROSASYNC_PROFILE",
-    "FASTRTPS_DEFAULT_PROFILES_FILE",
-    "FASTDDS_DEFAULT_PROFILES_FILE",
-)
+SWITCH = "ROSASYNC_PROFILE"
+OLD_PROFILE, NEW_PROFILE = "FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"
+"""The variable that Fast DDS reads up to version 2 (ROS 2 Jazzy), and from 3 on (Kilted)."""
 
 
 def doctor(as_json: AsJson = False) -> None:
-    r"""Say whether services can work on this machine.
+    """Say whether services can work on this machine.
 
     Each check that fails says what to do. It starts a server process of its own and calls it.
 
@@ -133,20 +132,22 @@ def _multicast(report: Report) -> None:
 
 def _profile(report: Report) -> None:
     """Say which profile of Fast DDS is in use."""
-    found = {name: os.environ[name] for name in PROFILES if os.environ.get(name)}
-    missing = [f"{n}={v}" for n, v in found.items() if "/" in v and not Path(v).is_file()]
-    report.add(
-        "profile",
-        not missing if missing else None,
-        ", ".join(f"{name}={value}" for name, value in found.items()) or "none in the environment",
-        f"There is no such file: {', '.join(missing)}" if missing else _profile_hint(),
-    )
+    old = version("rclpy").startswith("7.")
+    read, other = (OLD_PROFILE, NEW_PROFILE) if old else (NEW_PROFILE, OLD_PROFILE)
+    found = {name: os.environ[name] for name in (SWITCH, read, other) if os.environ.get(name)}
+    shown = ", ".join(f"{name}={value}" for name, value in found.items())
+    if read not in found and other in found:
+        report.add("profile", False, shown, f"This Fast DDS reads {read} instead")
+    elif read in found and not Path(found[read]).is_file():
+        report.add("profile", False, shown, "There is no such file")
+    else:
+        report.add("profile", None, shown or "none in the environment", _profile_hint())
 
 
 def _profile_hint() -> str:
     if importlib.util.find_spec("rosasync.cli.profile") is None:
         return ""
-    return "A profile with frequent heartbeats helps where packets get lost: rosasync profile"
+    return "Where packets get lost, give other nodes the profile that repairs it: rosasync profile"
 
 
 async def _calls(report: Report) -> None:
@@ -175,7 +176,10 @@ async def _try(
         report.add(check, False, " ".join(str(error).split()), advice)
     else:
         discovery, call = discovered - begin, time.perf_counter() - discovered
-        report.add(check, True, f"discovered in {discovery:.2f} s, answered in {1e3 * call:.1f} ms")
+        slow = "; processes announce themselves every 3 s" if discovery > SLOW else ""
+        report.add(
+            check, True, f"discovered in {discovery:.2f} s{slow}, answered in {1e3 * call:.1f} ms"
+        )
 
 
 @asynccontextmanager

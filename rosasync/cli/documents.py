@@ -11,6 +11,7 @@ import json
 import math
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import Any
 
 import yaml
@@ -21,6 +22,9 @@ __all__ = ["DocumentError", "documents", "dump_json", "dump_yaml", "plain", "rea
 
 _Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _Dumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+
+_UNREADABLE = re.compile(r"[\x7f-\x9f\u2028\u2029\ufeff\ufffe\uffff]")
+"""Characters that JSON allows in a text and YAML does not, or takes for the end of a line."""
 
 _ONE_LINE = 2**31 - 1
 
@@ -122,7 +126,8 @@ def dump_yaml(value: object) -> str:
 
 def dump_json(value: object) -> str:
     """Return a value as one line of JSON; NaN and infinity become texts, which are read again."""
-    return json.dumps(_finite(value), ensure_ascii=False, allow_nan=False)
+    text = json.dumps(_finite(value), ensure_ascii=False, allow_nan=False)
+    return _UNREADABLE.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
 
 
 def _fit_fields(values: dict[Any, Any], message_type: type[Any]) -> dict[str, Any]:
@@ -150,11 +155,11 @@ def _fit_text(text: _Plain, field: FieldType) -> Any:
         return word in _TRUE
     if field.kind in ("int", "byte", "float") and _INTEGER.fullmatch(text):
         return int(text, 0) if text.lstrip("+-")[:2].lower() in ("0x", "0o", "0b") else int(text)
+    if field.kind == "float" and word in _FLOATS:
+        return _FLOATS[word]
     if field.kind == "float":
-        try:
-            return _FLOATS.get(word, float(text))
-        except ValueError:
-            return _FLOATS.get(word, str(text))
+        with suppress(ValueError):
+            return float(text)
     return str(text)
 
 

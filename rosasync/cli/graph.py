@@ -11,6 +11,7 @@ from rosasync.cli.errors import CliError, Code
 from rosasync.ros.messages import service_type
 
 __all__ = [
+    "POLL",
     "explain_type",
     "find_type",
     "is_hidden",
@@ -27,6 +28,7 @@ QUIET = 0.3
 """Seconds without a change after which the graph seems complete."""
 
 POLL = 0.02
+"""Seconds between two looks at the graph."""
 
 
 async def settle(session: rosasync.Session, wait: float | None = None) -> None:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from typing import Any
 
 import rosasync
-from rosasync.cli.graph import settle
+from rosasync.cli.graph import POLL, settle
 from rosasync.cli.output import note
 
 __all__ = ["switched_on"]
@@ -51,7 +52,7 @@ async def switched_on(session: rosasync.Session, name: str) -> AsyncIterator[Non
             before = await _switch(session, node, PARAMETERS[role])
             if before is not None:
                 switched.append((node, PARAMETERS[role], before))
-        if not switched:
+        if not (switched and await _is_published(session, name)):
             note(HOW.format(name=name))
     try:
         yield
@@ -60,6 +61,18 @@ async def switched_on(session: rosasync.Session, name: str) -> AsyncIterator[Non
             with suppress(rosasync.RosasyncError, asyncio.CancelledError):
                 await _set(session, node, parameter, before)
                 note(f"{node}: {parameter} is '{before}' again")
+
+
+async def _is_published(session: rosasync.Session, name: str) -> bool:
+    """Wait until introspection of the service is published, and return whether it is."""
+    from rosasync.ros.inspect import count_publishers
+
+    end = time.monotonic() + TIMEOUT
+    while not count_publishers(session.node, f"{name}/_service_event"):
+        if time.monotonic() > end:
+            return False
+        await asyncio.sleep(POLL)
+    return True
 
 
 async def _switch(session: rosasync.Session, node: str, parameter: str) -> str | None:

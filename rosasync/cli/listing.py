@@ -25,7 +25,7 @@ def list_services(
     as_json: AsJson = False,
     wait: Wait = None,
 ) -> None:
-    r"""List the services that have a server.
+    """List the services that have a server.
 
     \b
     Examples:
@@ -51,7 +51,7 @@ def type_of(
     as_json: AsJson = False,
     timeout: Annotated[float, typer.Option(min=0.0, help="Seconds to wait for a server.")] = 5.0,
 ) -> None:
-    r"""Print the type of a service.
+    """Print the type of a service.
 
     \b
     Examples:
@@ -75,7 +75,7 @@ async def _type_of(name: str, as_json: bool, timeout: float) -> None:
 def find(
     srv_type: Type, hidden: Hidden = False, as_json: AsJson = False, wait: Wait = None
 ) -> None:
-    r"""List the services of a type.
+    """List the services of a type.
 
     \b
     Examples:
@@ -97,7 +97,7 @@ async def _find(srv_type: str, hidden: bool, as_json: bool, wait: float | None) 
 
 
 def info(name: Name, as_json: AsJson = False, wait: Wait = None) -> None:
-    r"""Show the servers and clients of a service.
+    """Show the servers and clients of a service.
 
     Each with its node, type and QoS; then what clashes, such as two types or several servers.
 
@@ -157,7 +157,7 @@ def clashes(servers: list[Endpoint], clients: list[Endpoint]) -> list[str]:
 
 
 def nodes(hidden: Hidden = False, as_json: AsJson = False, wait: Wait = None) -> None:
-    r"""List the nodes.
+    """List the nodes.
 
     \b
     Examples:

@@ -31,8 +31,8 @@ class Tally:
     latencies: list[float] = field(default_factory=list)
     failures: Counter[str] = field(default_factory=Counter)
     codes: set[Code] = field(default_factory=set)
-    started: float = field(default_factory=time.perf_counter)
-    ended: float = field(default_factory=time.perf_counter)
+    started: float = 0.0
+    ended: float = 0.0
 
     @property
     def answered(self) -> int:
@@ -56,6 +56,10 @@ class Tally:
             return Code.ANSWERED
         return next(iter(self.codes)) if len(self.codes) == 1 else Code.FAILED
 
+    def start(self) -> None:
+        """Start the clock."""
+        self.started = self.ended = time.perf_counter()
+
     def add(self, seconds: float) -> None:
         """Count an answered call."""
         self.latencies.append(seconds)
@@ -67,9 +71,13 @@ class Tally:
         self.codes.add(code_of(error))
         self.ended = time.perf_counter()
 
-    def figures(self) -> dict[str, Any]:
-        """Return the counts and percentiles, for JSON."""
-        ordered = sorted(self.latencies)
+    def figures(self, latest: int = 0) -> dict[str, Any]:
+        """Return the counts and percentiles, for JSON.
+
+        Args:
+            latest: the number of calls that the percentiles are of, the latest ones; 0 for all.
+        """
+        ordered = sorted(self.latencies[-latest:])
         return {
             "answered": self.answered,
             "failed": dict(self.failures),
@@ -81,9 +89,9 @@ class Tally:
             "max_ms": milliseconds(percentile(ordered, 100)),
         }
 
-    def lines(self) -> list[str]:
-        """Return the summary as lines of text."""
-        shown = self.figures()
+    def lines(self, latest: int = 0) -> list[str]:
+        """Return the summary as lines of text; ``latest`` is as for `figures`."""
+        shown = self.figures(latest)
         lines = [
             f"{self.answered} answered, {self.failed} failed in {shown['seconds']:g} s "
             f"({shown['calls_per_s']:g} calls/s)"
@@ -158,7 +166,7 @@ async def make_calls(
             tally.add(seconds)
             on_response(response, seconds)
 
-    tally.started = time.perf_counter()
+    tally.start()
     try:
         async with asyncio.TaskGroup() as group:
             for _ in range(callers):

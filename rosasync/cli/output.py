@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import io
 import re
 import sys
 from collections.abc import AsyncIterator, Callable
@@ -52,8 +51,6 @@ def console() -> Console:
     """Return the console of standard output; it obeys NO_COLOR, COLUMNS and pipes."""
     from rich.console import Console
 
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="replace")  # for terminals without Unicode
     return Console(highlight=False, markup=False, soft_wrap=not sys.stdout.isatty())
 
 
@@ -70,7 +67,11 @@ async def progress(render: Callable[[], RenderableType]) -> AsyncIterator[None]:
     from rich.live import Live
 
     screen = Console(stderr=True, highlight=False, markup=False)
-    with Live(render(), console=screen, auto_refresh=False, transient=True) as live:
+    # What is printed to the same terminal has to go around the live lines; a pipe gets it as it is.
+    same = sys.stdout.isatty()
+    with Live(
+        render(), console=screen, auto_refresh=False, transient=True, redirect_stdout=same
+    ) as live:
 
         async def draw() -> None:
             while True:

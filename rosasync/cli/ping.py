@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -11,7 +12,7 @@ import typer
 
 import rosasync
 from rosasync.cli.errors import CliError, Code
-from rosasync.cli.graph import find_type, resolve, srv_class, wait_for_types
+from rosasync.cli.graph import POLL, find_type, resolve, srv_class, wait_for_types
 from rosasync.cli.options import AsJson, Name, OptionalType, Timeout
 from rosasync.cli.output import print_json
 from rosasync.cli.requests import message_from
@@ -21,8 +22,8 @@ __all__ = ["ping"]
 
 PARAMETERS = "rcl_interfaces/srv/DescribeParameters"
 
-DISCOVERY = 1.0
-"""Seconds to wait for the parameter services, which the graph may show later than the service."""
+DISCOVERY = 3.0
+"""Seconds to wait for the server's node and its parameter services, which may show up later."""
 
 
 def ping(
@@ -35,7 +36,7 @@ def ping(
     timeout: Timeout = 5.0,
     as_json: AsJson = False,
 ) -> None:
-    r"""Say how far a call gets, and how long it takes.
+    """Say how far a call gets, and how long it takes.
 
     \b
     graph     a server is visible
@@ -105,13 +106,24 @@ async def _ping(
 
 async def _ask_node(session: rosasync.Session, phases: _Phases, name: str) -> None:
     """Ask the server's node something harmless: to describe no parameters."""
-    from rosasync.ros.inspect import server_endpoints
-
-    servers = server_endpoints(session.node, resolve(session, name))
-    node = next((server.node for server in servers if server.node), None)
+    node = await _server_node(session, resolve(session, name))
     service = f"{node}/describe_parameters"
     if node is None or not await wait_for_types(session, service, DISCOVERY):
         phases.skip("answered", "not asked: the node has no parameter services; use --request")
         return
     async with phases.phase("answered", f"by the node {node}; --request asks the service itself"):
         await session.call(PARAMETERS, service)
+
+
+async def _server_node(session: rosasync.Session, name: str) -> str | None:
+    """Wait until the node of a server is known, and return its name; None if it stays unknown."""
+    from rosasync.ros.inspect import server_endpoints
+
+    end = time.monotonic() + DISCOVERY
+    while True:
+        for server in server_endpoints(session.node, name):
+            if server.node:
+                return server.node
+        if time.monotonic() > end:
+            return None
+        await asyncio.sleep(POLL)

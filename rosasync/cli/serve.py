@@ -60,7 +60,7 @@ def serve(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    r"""Serve a service until Ctrl-C, and print what it is asked.
+    """Serve a service until Ctrl-C, and print what it is asked.
 
     \b
     Examples:
@@ -93,7 +93,7 @@ async def _serve(
     else:
         raise CliError("--handler answers itself: leave out the options of the stub")
     failure: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-    async with open_session() as session:
+    async with open_session(introspection="contents") as session:
         server = _start(session, found, name, _printing(answer, as_json, failure))
         note(f"serving {name} [{srv_type}]; Ctrl-C ends it")
         try:
@@ -101,7 +101,7 @@ async def _serve(
         finally:
             await server.aclose(CLOSE_TIMEOUT)
             counts = server.statistics()
-            note(f"{counts.taken} requests, {counts.responded} responses")
+            note(f"requests: {counts.taken}, responses: {counts.responded}")
 
 
 def _start(
@@ -165,7 +165,11 @@ class _Stub:
 
     async def answer(self, call: rosasync.ServiceCall[Any, Any]) -> Any:
         """Answer one request, late or never if the options say so."""
-        await asyncio.sleep(self._behaviour.delay)
+        try:
+            await asyncio.sleep(self._behaviour.delay)
+        except asyncio.CancelledError:
+            call.give_up("dropped: the server ended")
+            return None
         if random.random() < self._behaviour.drop_rate:
             call.give_up("dropped: --drop-rate")
             return None

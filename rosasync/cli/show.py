@@ -17,7 +17,7 @@ __all__ = ["show"]
 
 
 def show(srv_type: AnyType, as_json: AsJson = False) -> None:
-    r"""Show the fields, defaults and constants of a type.
+    """Show the fields, defaults and constants of a type.
 
     Fields of nested messages are indented below their field.
 

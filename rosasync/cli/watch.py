@@ -42,7 +42,7 @@ def watch(
     ] = 0,
     as_json: AsJson = False,
 ) -> None:
-    r"""Show the requests and responses of others as they pass.
+    """Show the requests and responses of others as they pass.
 
     They are seen only if their server or client publishes service introspection. If none does, it
     is switched on while the command runs, on nodes that have the parameter for it.
@@ -100,13 +100,13 @@ async def _watch(name: str, srv_type: str | None, count: int, as_json: bool) -> 
         async with (
             _events(session, found, resolved) as events,
             switched_on(session, resolved),
-            _screen(as_json) as show,
         ):
             note(f"watching {resolved}; Ctrl-C ends it")
             try:
-                while not count or seen < count:
-                    show(await events.get())
-                    seen += 1
+                async with _screen(as_json) as show:
+                    while not count or seen < count:
+                        show(await events.get())
+                        seen += 1
             finally:
                 note(f"{seen} events")
 

@@ -22,7 +22,7 @@ MATCH = 5.0
 def why(
     name: Name, srv_type: OptionalType = None, as_json: AsJson = False, wait: Wait = None
 ) -> None:
-    r"""Say why a call does not work, and what to do.
+    """Say why a call does not work, and what to do.
 
     Nothing is sent to the service.
 

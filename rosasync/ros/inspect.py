@@ -113,13 +113,14 @@ def graph_state(node: Node) -> object:
 
 
 def all_discovered(node: Node) -> bool:
-    """Return whether every participant of this machine has been discovered.
+    """Return whether every participant of this machine has been discovered, with its nodes.
 
     Each participant is one context of a process, and has a UDP port of its own in the range of the
-    domain. Participants on other machines, or in other network namespaces, cannot be counted.
+    domain. Participants on other machines, or in other network namespaces, cannot be counted. The
+    names of its nodes may come some time after its endpoints.
     """
     local = _local_participants(domain_id(node))
-    return 0 < local <= _participants(node)
+    return 0 < local <= _participants(node) <= len(node_names(node))
 
 
 def local_domains() -> dict[int, int]:

@@ -6,6 +6,7 @@ wants a response late, in another order or never, only sending it is put off.
 
 from __future__ import annotations
 
+import asyncio
 import heapq
 import itertools
 import os
@@ -57,7 +58,11 @@ class ServerProcess(Child):
 
     module = "tests.support.servers"
 
-    async def serve(
+    async def serve(self, name: str, srv_type: str = ECHO, **options: Any) -> None:
+        """Create a service without blocking the loop; the options are those of `serve_now`."""
+        await asyncio.to_thread(self.serve_now, name, srv_type, **options)
+
+    def serve_now(
         self,
         name: str,
         srv_type: str = ECHO,
@@ -77,7 +82,7 @@ class ServerProcess(Child):
             depth: the depth of its history; None for the default of ROS, 10.
             copies: how many services to create under this name.
         """
-        await self.ask(
+        self.ask_now(
             "serve",
             name=name,
             srv_type=srv_type,

@@ -1,0 +1,209 @@
+"""YAML and JSON of messages: every field type of the common interfaces makes the round trip."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rcl_interfaces.msg import ParameterValue
+from std_srvs.srv import SetBool
+
+from rosasync import to_dict, to_message
+from rosasync.cli.documents import (
+    DocumentError,
+    documents,
+    dump_json,
+    dump_yaml,
+    plain,
+    read_message,
+)
+from rosasync.cli.requests import template
+from rosasync.ros.interfaces import installed_types, parts
+from rosasync.ros.messages import FieldType, field_types
+
+PACKAGES = {
+    "diagnostic_msgs",
+    "geometry_msgs",
+    "lifecycle_msgs",
+    "nav_msgs",
+    "rcl_interfaces",
+    "sensor_msgs",
+    "shape_msgs",
+    "std_msgs",
+    "std_srvs",
+    "stereo_msgs",
+    "trajectory_msgs",
+    "visualization_msgs",
+}
+
+MESSAGES = [
+    part.message_type
+    for kind in ("msg", "srv")
+    for name in installed_types(kind)
+    if name.partition("/")[0] in PACKAGES
+    for part in parts(name)
+]
+
+
+def leaves(field: FieldType) -> set[str]:
+    """The labels of the basic types, and of arrays of them, that a field consists of."""
+    if field.message_type is not None:
+        return set().union(*(leaves(inner) for inner in field_types(field.message_type).values()))
+    element = field.element
+    return {field.label} if element is None or element.message_type is None else leaves(element)
+
+
+def representatives() -> list[Any]:
+    """The fewest messages, in order, that have every field type of all messages."""
+    chosen, covered = [], set[str]()
+    for message_type in MESSAGES:
+        found = set().union(*(leaves(field) for field in field_types(message_type).values()))
+        if found - covered:
+            covered |= found
+            chosen.append(message_type)
+    return chosen
+
+
+SURPRISES = ["", "on", "no", "~", "null", "010", "1e5", "1:30", ".nan", "2024-01-01", "- a", "a: b"]
+CHARACTERS = [
+    "#",
+    "'",
+    '"',
+    "\\",
+    "é",
+    "\U0001f916",
+    "two\nlines",
+    "\t",
+    " padded ",
+    "\x85",
+    "\u2028",
+]
+TEXTS = st.sampled_from([*SURPRISES, *CHARACTERS]) | st.text(
+    st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=8
+)
+
+_BITS = {"int8": 8, "int16": 16, "int32": 32, "int64": 64}
+
+
+def values_of(field: FieldType) -> st.SearchStrategy[Any]:
+    if field.message_type is not None:
+        return messages_of(field.message_type)
+    if field.element is not None:
+        size = field.label.rpartition("[")[2].removesuffix("]")
+        least = int(size) if size.isdigit() else 0
+        most = least or min(int(size.removeprefix("<=") or 3), 3)
+        if field.element.kind in ("byte", "int", "float", "bool") and least:
+            return st.lists(values_of(field.element), min_size=least, max_size=least)
+        return st.lists(values_of(field.element), min_size=least, max_size=most)
+    if field.kind == "int":
+        bits = _BITS[field.label.removeprefix("u")]
+        unsigned = field.label.startswith("u")
+        low, high = (0, 2**bits - 1) if unsigned else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
+        return st.integers(low, high)
+    kinds: dict[str, st.SearchStrategy[Any]] = {
+        "bool": st.booleans(),
+        "byte": st.integers(0, 255),
+        "float": st.floats(width=32 if field.label == "float32" else 64),
+        "string": TEXTS,
+    }
+    return kinds[field.kind]
+
+
+def messages_of(message_type: Any) -> st.SearchStrategy[dict[str, Any]]:
+    return st.fixed_dictionaries(
+        {name: values_of(field) for name, field in field_types(message_type).items()}
+    )
+
+
+def test_the_messages_have_every_field_type() -> None:
+    assert len(MESSAGES) > 150
+    labels = set().union(
+        *(leaves(field) for kind in representatives() for field in field_types(kind).values())
+    )
+    assert {"bool", "byte", "float32", "float64", "string", "uint8[]", "float64[36]"} <= labels
+    assert {f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)} <= labels
+
+
+@pytest.mark.parametrize("message_type", representatives())
+@settings(max_examples=15, deadline=None)
+@given(data=st.data())
+def test_round_trip(message_type: Any, data: st.DataObject) -> None:
+    message = to_message(message_type, data.draw(messages_of(message_type)))
+    expected = repr(to_dict(message))  # NaN differs from itself
+    assert repr(to_dict(read_message(message_type, dump_yaml(plain(message))))) == expected
+    assert repr(to_dict(read_message(message_type, dump_json(plain(message))))) == expected
+
+
+@pytest.mark.parametrize("message_type", MESSAGES)
+def test_a_template_is_the_message_of_defaults(message_type: Any) -> None:
+    assert read_message(message_type, template(message_type)) == message_type()
+
+
+def test_other_readers_of_yaml_and_json_understand_it() -> None:
+    message = ParameterValue(string_value="on", bool_value=True, double_value=math.inf)
+    assert yaml.safe_load(dump_yaml(plain(message)))["string_value"] == "on"
+    assert yaml.safe_load(dump_yaml(plain(message)))["double_value"] == math.inf
+    assert json.loads(dump_json(plain(message)))["double_value"] == "Infinity"
+
+
+@pytest.mark.parametrize("text", ["on", "no", "010", "1e5", "~", "null", "2024-01-01", "1:30"])
+def test_a_string_field_takes_the_text_as_written(text: str) -> None:
+    assert read_message(ParameterValue, f"string_value: {text}").string_value == text
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("true", True), ("Yes", True), ("ON", True), ("false", False), ("no", False), ("off", False)],
+)
+def test_a_bool_field_takes_the_words_of_yaml(text: str, value: bool) -> None:
+    assert read_message(SetBool.Request, f"data: {text}").data is value
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("010", 10), ("0x1f", 31), ("0o17", 15), ("0b11", 3), ("1_000", 1000), ("+5", 5), ("-5", -5)],
+)
+def test_an_integer_field_takes_integers(text: str, value: int) -> None:
+    assert read_message(ParameterValue, f"integer_value: {text}").integer_value == value
+
+
+@pytest.mark.parametrize(
+    ("text", "value"), [("1e5", 1e5), ("3", 3.0), ("-.inf", -math.inf), ('"Infinity"', math.inf)]
+)
+def test_a_float_field_takes_numbers(text: str, value: float) -> None:
+    assert read_message(ParameterValue, f"double_value: {text}").double_value == value
+
+
+@pytest.mark.parametrize(
+    ("message_type", "text", "says"),
+    [
+        pytest.param(SetBool.Request, "data: maybe", "data: expected bool", id="word"),
+        pytest.param(SetBool.Request, "data: 'true'", "expected bool", id="quotes"),
+        pytest.param(SetBool.Request, "data: 1", "expected bool", id="number"),
+        pytest.param(SetBool.Request, "data:", "expected bool", id="nothing"),
+        pytest.param(SetBool.Request, "true", "as 'name: value'", id="no mapping"),
+        pytest.param(SetBool.Request, "data: [", "not YAML", id="syntax"),
+        pytest.param(SetBool.Request, "data: !!python/name:os.getcwd", "not YAML", id="tag"),
+        pytest.param(SetBool.Request, "&a {data: *a}", "expected bool", id="recursion"),
+        pytest.param(ParameterValue, "integer_value: 1.5", "integer_value", id="float"),
+        pytest.param(ParameterValue, "byte_array_value: [256]", "[0]", id="range"),
+    ],
+)
+def test_what_does_not_fit_is_refused(message_type: Any, text: str, says: str) -> None:
+    with pytest.raises(DocumentError) as refused:
+        read_message(message_type, text)
+    assert says in str(refused.value)
+
+
+def test_a_stream_is_split_at_its_marks() -> None:
+    text = "---\n# only a comment\n---\na: 1\n--- {b: 2}\n---\nc: |\n  text\n"
+    assert [yaml.safe_load(part) for part in documents(text)] == [
+        {"a": 1},
+        {"b": 2},
+        {"c": "text\n"},
+    ]
