@@ -16,6 +16,7 @@ from rosasync.errors import (
 
 if TYPE_CHECKING:
     from rosasync.ports import NodePort, Service
+    from rosasync.retry import Attempts
 
 __all__ = ["CallErrors"]
 
@@ -41,9 +42,11 @@ class CallErrors:
         )
         return self._make(QueueTimeout, message, elapsed)
 
-    def response_timeout(self, elapsed: float) -> CallError:
+    def response_timeout(self, elapsed: float, attempts: Attempts | None) -> CallError:
         """Return the error for a request that was sent and not answered."""
         message = f"the request was sent, but not answered within {elapsed:.3g} s"
+        if attempts is not None:
+            message += attempts.explain_timeout()
         return self._make(ResponseTimeout, message, elapsed)
 
     def server_gone(self, elapsed: float) -> CallError:

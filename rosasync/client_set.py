@@ -8,14 +8,14 @@ import math
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
-from rosasync.client import Client, Counts
+from rosasync.client import Client, ClientOwner, Counts
 from rosasync.ports import PortDestroyed
 
 if TYPE_CHECKING:
     from rosasync.call_errors import CallErrors
     from rosasync.graph_watch import GraphWatch
     from rosasync.options import Limits
-    from rosasync.ports import NodePort, Service
+    from rosasync.ports import NodePort, Servers, Service
 
 __all__ = ["ClientSet"]
 
@@ -34,8 +34,7 @@ class ClientSet:
         limits: how many clients there may be, and how long an idle one is kept.
         watch: counts the generations of the graph.
         errors: makes the errors of the service's calls.
-        on_capacity: called when a place in a client's window becomes free.
-        has_callers: returns whether callers wait for a client. If so, no client is evicted.
+        owner: the service. No client is evicted while it has callers that wait.
     """
 
     def __init__(
@@ -45,17 +44,18 @@ class ClientSet:
         limits: Limits,
         watch: GraphWatch,
         errors: CallErrors,
-        on_capacity: Callable[[], None],
-        has_callers: Callable[[], bool],
+        owner: ClientOwner,
     ) -> None:
         self.counts = Counts()
+        # What the graph showed when it last changed.
+        self.share = 0
+        self.servers = 0
         self._service = service
         self._node = node
         self._limits = limits
         self._watch = watch
         self._errors = errors
-        self._on_capacity = on_capacity
-        self._has_callers = has_callers
+        self._owner = owner
         self._loop = asyncio.get_running_loop()
         self._clients: list[Client] = []
         # The first client starts it. It stops when no client is left.
@@ -105,6 +105,25 @@ class ClientSet:
             for client in self._clients
         )
 
+    @property
+    def awaits_resend(self) -> bool:
+        """Whether a request waits to be sent again."""
+        return any(client.awaits_resend for client in self._clients)
+
+    @property
+    def awaits_match_to_resend(self) -> bool:
+        """Whether such a request waits with a client that is not known to be matched."""
+        generation = self._watch.generation
+        return any(
+            client.awaits_resend and client.matched_generation != generation
+            for client in self._clients
+        )
+
+    @property
+    def is_outstanding(self) -> bool:
+        """Whether a server may have a request."""
+        return any(client.is_outstanding for client in self._clients)
+
     def lease(self) -> Client | None:
         """Lease a matched client that has capacity, if there is one."""
         watch = self._watch
@@ -140,14 +159,25 @@ class ClientSet:
         """Return whether a client is matched with a server."""
         return any(self.is_matched(client) for client in self)
 
+    def send_resends(self) -> None:
+        """Send the requests again that waited for a server."""
+        for client in self:
+            if client.awaits_resend and self.is_matched(client):
+                client.send_resends()
+
     def find_lost_requests(self) -> bool:
-        """Return whether a request has lost all its servers, even if there are new ones."""
+        """Return whether a request has lost all its servers, even if there are new ones.
+
+        New servers free the places of the abandoned requests that they have not had.
+        """
         if self.servers_gone():
             return True
         if self._lost_generation == self._watch.generation:
             return False
         self._lost_generation = self._watch.generation
         servers = self._node.find_servers(self._service)
+        for client in self:
+            client.free_predecessors(servers)
         return any(client.has_lost(servers) for client in self)
 
     def servers_gone(self) -> bool:
@@ -159,8 +189,12 @@ class ClientSet:
         return not self._node.find_servers(self._service)
 
     def fail_lost(self, error: Callable[[], Exception]) -> None:
-        """End the calls whose servers are all gone, even if there are new ones."""
-        servers = self._node.find_servers(self._service)
+        """End the calls whose servers are all gone, unless they may go to the next server."""
+        servers: Servers = frozenset()
+        if self.servers_gone():
+            self._watch.advance()
+        else:
+            servers = self._node.find_servers(self._service)
         for client in self:
             client.fail_lost(servers, error)
 
@@ -191,7 +225,7 @@ class ClientSet:
             lambda deliver: self._node.open_client(self._service, deliver),
             self._limits,
             self.counts,
-            self._on_capacity,
+            self._owner,
         )
         self._clients.append(client)
         self.share_queue()
@@ -206,11 +240,17 @@ class ClientSet:
 
         Call it after every change of the graph.
         """
-        window = self._limits.window(self._node.count_clients(self._service))
+        self.servers = self._node.count_servers(self._service)
+        clients = self._node.count_clients(self._service)
+        self.share = self._limits.share(clients)
         for client in self._clients:
-            grows, client.window = client.window < window, window
-            if grows:
-                self._on_capacity()
+            client.resize(self._limits.window(clients))
+
+    def request_place(self) -> None:
+        """Let the clients give up the place of an abandoned request, because a caller waits."""
+        for client in self._clients:
+            if client.abandoned:
+                client.start_timer()
 
     def touch(self) -> None:
         """Begin the idle time of the clients again."""
@@ -224,7 +264,7 @@ class ClientSet:
             self._clients.remove(client)
             client.fail(self._errors.client_destroyed)
             client.close()
-            self._on_capacity()
+            self._owner.on_capacity()
 
     def fail(self, error: Callable[[], Exception]) -> None:
         """End every call in flight with an error."""
@@ -274,7 +314,7 @@ class ClientSet:
         now, idle = self._loop.time(), self._limits.idle
         self._evict_timer = None
         for client in self:
-            if client.is_idle and client.idle_since + idle <= now and not self._has_callers():
+            if client.is_idle and client.idle_since + idle <= now and not self._owner.has_callers():
                 self._clients.remove(client)
                 client.close()
         if self._clients:

@@ -141,12 +141,15 @@ class Limits:
         if self.server_depth is not None:
             _set(self, "server_depth", check_count("server_depth", self.server_depth, 1))
 
-    def window(self, clients: int) -> int:
-        """Return the window of each client, given the number of clients in the graph."""
+    def share(self, clients: int) -> int:
+        """Return each client's share of the server's queue, for so many clients in the graph."""
         if self.server_depth is None:
             return self.in_flight
-        depth = max(self.server_depth, self.in_flight)
-        return min(self.in_flight, max(1, depth // max(1, clients)))
+        return max(1, max(self.server_depth, self.in_flight) // max(1, clients))
+
+    def window(self, clients: int) -> int:
+        """Return the window of each client, given the number of clients in the graph."""
+        return min(self.in_flight, self.share(clients))
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,6 +162,8 @@ class Retry:
         attempts: the maximum number of times the request is sent, including the first.
         after: seconds to wait for a response before the second attempt.
         backoff: the factor by which this wait grows with each further attempt.
+        budget: how many requests of the service may be sent again for each call, 0.2 for one in
+            five. Ten a second may be sent again besides. Unlimited if it is ``math.inf``.
 
     Raises:
         TypeError: a value is not a number.
@@ -168,6 +173,7 @@ class Retry:
     attempts: int = 3
     after: float = 0.5
     backoff: float = 2.0
+    budget: float = 0.2
 
     def __post_init__(self) -> None:
         _set(self, "attempts", check_count("attempts", self.attempts, 1))
@@ -175,6 +181,9 @@ class Retry:
         _set(self, "backoff", _as_float("backoff", self.backoff, "a number"))
         if self.backoff < 1:
             raise ValueError(f"backoff must be at least 1, got {self.backoff!r}")
+        _set(self, "budget", _as_float("budget", self.budget, "a number"))
+        if self.budget < 0:
+            raise ValueError(f"budget must not be negative, got {self.budget!r}")
 
 
 @dataclass(frozen=True, slots=True)

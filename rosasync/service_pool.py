@@ -18,6 +18,7 @@ from rosasync.client import Client
 from rosasync.client_set import ClientSet
 from rosasync.errors import ContextShutdown, RosasyncError
 from rosasync.ports import PortDestroyed
+from rosasync.retry import Attempts, RetryBudget
 from rosasync.statistics import KeyStatistics
 
 if TYPE_CHECKING:
@@ -64,10 +65,9 @@ class ServicePool:
         self._deadlines = deadlines
         self._loop = asyncio.get_running_loop()
         self._errors = CallErrors(service, node)
-        self._clients = ClientSet(
-            service, node, limits, watch, self._errors, self._on_capacity, self._has_callers
-        )
+        self._clients = ClientSet(service, node, limits, watch, self._errors, self)
         self._counts = self._clients.counts
+        self._budget = RetryBudget(self._counts, self._loop.time)
         self._queue: OrderedDict[asyncio.Future[Any], OnClient] = OrderedDict()
         # Each caller who waits for a match, with the client to be matched: None for any client.
         self._ready_waiters: dict[asyncio.Future[None], Client | None] = {}
@@ -101,17 +101,23 @@ class ServicePool:
         for leased in self._ready_waiters.values():
             if leased is None or leased.matched_generation != generation:
                 return True
+        if self._clients.awaits_match_to_resend:
+            return True
         return bool(self._queue) and self._clients.awaits_match
 
     def statistics(self) -> KeyStatistics:
         """Take a snapshot."""
+        counts = asdict(self._counts)
+        del counts["sent"]
         return KeyStatistics(
             clients=len(self._clients),
             idle=self._clients.idle,
             waiting=len(self._queue),
             abandoned=self._clients.abandoned,
             window=self._clients.window,
-            **asdict(self._counts),
+            share=self._clients.share,
+            servers=self._clients.servers,
+            **counts,
         )
 
     # Calls, leases and waits.
@@ -142,7 +148,8 @@ class ServicePool:
         loop = self._loop
         started = loop.time()
         deadline = None if timeout is None else started + timeout
-        call = Call(loop.create_future(), request, retry, leased is not None)
+        attempts = None if retry is None else Attempts(retry, self._budget)
+        call = Call(loop.create_future(), request, attempts, leased is not None)
         entry = None
         try:
             if leased is not None:
@@ -265,11 +272,27 @@ class ServicePool:
     def on_graph(self) -> None:
         """Check the graph again: the shares of the queue, the matches and the lost servers."""
         self._clients.share_queue()
-        if self._has_callers():
+        if self.has_callers() or self._clients.awaits_resend:
             self._dispatch()
-        outstanding = self._counts.in_flight or self._clients.abandoned
+        outstanding = self._clients.is_outstanding
         if outstanding and self._gone_timer is None and self._clients.find_lost_requests():
             self._gone_timer = self._loop.call_later(GONE_DELAY, self._end_requests)
+
+    # For the clients.
+
+    def on_capacity(self) -> None:
+        """Schedule a dispatch if callers wait."""
+        if self._queue or self._ready_waiters:
+            self._schedule_dispatch()
+
+    def on_resend_waiting(self) -> None:
+        """Poll for a match if a request that is to be sent again waits for it."""
+        if self._clients.awaits_match_to_resend:
+            self._watch.poll_soon()
+
+    def has_callers(self) -> bool:
+        """Return whether callers wait for a place or for a match."""
+        return bool(self._queue or self._ready_waiters)
 
     # The queue.
 
@@ -290,13 +313,8 @@ class ServicePool:
         self._queue[waiter] = on_client
         if capacity and not waiting:
             self._schedule_dispatch()
-
-    def _has_callers(self) -> bool:
-        return bool(self._queue or self._ready_waiters)
-
-    def _on_capacity(self) -> None:
-        if self._queue or self._ready_waiters:
-            self._schedule_dispatch()
+        elif not capacity:
+            self._clients.request_place()
 
     def _schedule_dispatch(self) -> None:
         if not self._dispatch_scheduled and not self._loop.is_closed():
@@ -315,6 +333,7 @@ class ServicePool:
         if self._ending is not None:
             return
         self._wake_ready_waiters()
+        self._clients.send_resends()
         while self._queue:
             waiter, on_client = next(iter(self._queue.items()))
             client = None if waiter.done() else self._clients.lease()
@@ -376,6 +395,7 @@ class ServicePool:
             waiter: asyncio.Future[None] = self._loop.create_future()
             self._ready_waiters[waiter] = leased
             self._watch.poll_soon()
+            self._clients.request_place()
             try:
                 await self._wait(waiter, deadline)
             finally:
@@ -410,11 +430,7 @@ class ServicePool:
     def _end_requests(self) -> None:
         self._gone_timer = None
         with self._watch.reports_shutdown():
-            if self._clients.servers_gone():
-                self._watch.advance()
-                self._clients.fail(_Gone)
-            else:
-                self._clients.fail_lost(_Gone)
+            self._clients.fail_lost(_Gone)
 
     def _unreached(self, started: float) -> Exception:
         """Make the error for a deadline that passed before the request was sent."""
@@ -453,7 +469,7 @@ class ServicePool:
             case Expired() if not call.started:
                 return self._unreached(started)
             case Expired():
-                return self._errors.response_timeout(elapsed)
+                return self._errors.response_timeout(elapsed, call.attempts)
             case _Gone():
                 return self._errors.server_gone(elapsed)
             case PortDestroyed():

@@ -44,10 +44,15 @@ class KeyStatistics:
         timed_out: calls whose deadline passed, in any phase.
         cancelled: calls cancelled, in any phase.
         failed: calls that ended with another error, such as `ServerGone` or `SessionClosed`.
-        abandoned: requests without a caller that still count as outstanding.
+        abandoned: requests that still count as outstanding, although their callers have left, or
+            although they were sent again.
         window: the maximum number of outstanding requests of all clients together, now.
+        share: the places in the server's queue for each client, by the number of clients that the
+            graph shows (in total: the sum over the services).
+        servers: the servers that have the service's name, as the graph showed when it last changed.
         late: responses that arrived after their caller had left.
         retried: requests sent again.
+        fast_retries: those of them that were sent again because later requests were answered.
     """
 
     clients: int = 0
@@ -62,8 +67,11 @@ class KeyStatistics:
     failed: int = 0
     abandoned: int = 0
     window: int = 0
+    share: int = 0
+    servers: int = 0
     late: int = 0
     retried: int = 0
+    fast_retries: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,6 +12,7 @@ from rosasync import Limits, Retry
 from rosasync.aio import Deadlines, Expired
 from rosasync.call import Call
 from rosasync.client import Client, Counts
+from rosasync.retry import Attempts, RetryBudget
 from rosasync.statistics import ServiceKey
 from rosasync.testing import FakeClient, FakeGraph, FakeNode
 from tests.support.times import TICK, until
@@ -24,20 +25,29 @@ class ClientUnderTest:
         self.node = FakeNode(FakeGraph())
         self.counts = Counts()
         self.capacity = 0
-        self.client = Client(self._open, Limits(**limits), self.counts, self._on_capacity)
+        self.callers = False
+        self.client = Client(self._open, Limits(**limits), self.counts, self)
+        self.budget = RetryBudget(self.counts, asyncio.get_running_loop().time)
         self._deadlines = Deadlines()
 
     def _open(self, deliver: Callable[[int, Any], None]) -> FakeClient:
         self.port = FakeClient(self.node, ServiceKey("/echo", ""), deliver)
+        self.port.ready = lambda: True  # type: ignore[method-assign]
         self.node.clients.append(self.port)
         return self.port
 
-    def _on_capacity(self) -> None:
+    def on_capacity(self) -> None:
         self.capacity += 1
+
+    def on_resend_waiting(self) -> None: ...
+
+    def has_callers(self) -> bool:
+        return self.callers
 
     async def call(self, deadline: float | None = None, retry: Retry | None = None) -> Any:
         """Call as on a lease, so that no lease of the client is released."""
-        call = Call(asyncio.get_running_loop().create_future(), None, retry, leased=True)
+        attempts = None if retry is None else Attempts(retry, self.budget)
+        call = Call(asyncio.get_running_loop().create_future(), None, attempts, leased=True)
         call.start(self.client)
         if deadline is not None:
             self._deadlines.set(call.future, deadline)
@@ -59,7 +69,7 @@ async def test_a_closed_client_starts_no_timer_for_a_late_response() -> None:
     under_test.client.close()
     loop = asyncio.get_running_loop()
     before = len(loop._scheduled)  # type: ignore[attr-defined]
-    under_test.client.forget_later(1)
+    under_test.client.leave(1)
     assert len(loop._scheduled) == before  # type: ignore[attr-defined]
 
 
@@ -135,7 +145,7 @@ async def test_close_is_idempotent_and_leaves_no_timer() -> None:
     task = await tested.calling()
     task.cancel()
     await asyncio.wait([task])
-    timer = tested.client._grace_timer
+    timer = tested.client._timer
     assert timer is not None
     tested.client.close()
     tested.client.close()

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import random
 from collections.abc import AsyncIterator, Callable
 from typing import Any
 
 import pytest
 
-from rosasync import Limits, Retry, RosasyncError, Session
+from rosasync import Limits, Retry, RosasyncError, Session, response_times
 from rosasync.ports import PortDestroyed
 from rosasync.service_pool import ServicePool
 from rosasync.testing import FakeClient, FakeGraph, FakeServer
@@ -42,7 +43,8 @@ class Run:
             in_flight=choose.choice([1, 1, 2, 10]),
             waiting=choose.choice([0, 3, 50, 10_000]),
             idle=choose.choice([0.0, SHORT, 4 * SHORT, 300.0]),
-            grace=choose.choice([0.0, SHORT, 6 * SHORT]),
+            grace=choose.choice([0.0, SHORT, 6 * SHORT, 100.0]),
+            server_depth=choose.choice([1, 10, None]),
         )
         self.graph = FakeGraph(graph_events=choose.random() < 0.6)
         self.faults = contextlib.ExitStack()
@@ -84,7 +86,11 @@ class Run:
         return self.choose.choice([None, 0.0, SHORT / 2, 4 * SHORT])
 
     def retry(self, often: float) -> Retry | None:
-        return Retry(3, SHORT, 1.5) if self.choose.random() < often else None
+        choose = self.choose
+        if choose.random() >= often:
+            return None
+        attempts, after = choose.choice([1, 2, 3, 10]), choose.choice([0.0, SHORT, 1000.0])
+        return Retry(attempts, after, 1.5, choose.choice([0.0, 0.2, math.inf]))
 
     def start(self, number: int) -> asyncio.Task[Any]:
         wait = self.choose.random() < 0.8
@@ -165,6 +171,8 @@ class Run:
         assert len(self.service.clients) <= self.limits.clients
         for client in self.service.clients:
             assert 0 <= client.leases <= self.limits.in_flight
+            # Each has a place, or is an attempt that is known or presumed to have left the queue.
+            assert client.leases + client.abandoned <= max(client.window, self.limits.in_flight)
         for task in [task for task in self.tasks if task.done()]:
             number = self.tasks.pop(task)
             if task.cancelled():
@@ -255,6 +263,8 @@ async def test_random_operations_leave_nothing_behind(
         return send(client, request)
 
     monkeypatch.setattr(FakeClient, "send", record)
+    monkeypatch.setattr(response_times, "PATIENCE_INITIAL", 2 * SHORT)
+    monkeypatch.setattr(response_times, "PATIENCE_MIN", SHORT)
     for seed in seeds:
         sent.clear()
         async with running(seed) as run:
