@@ -10,6 +10,7 @@ import asyncio
 import json
 import os
 import select
+import signal
 import subprocess
 import sys
 import threading
@@ -127,6 +128,11 @@ class Child:
         self._reap()
         for file in leftovers:
             file.unlink(missing_ok=True)
+
+    def interrupt(self) -> None:
+        """End it as Ctrl-C does (SIGINT), which rclpy's signal handlers do not see here."""
+        self._process.send_signal(signal.SIGINT)
+        self.close()
 
     def close(self) -> None:
         """Ask it to end by closing its stdin, and wait for that; kill it if it does not end."""
