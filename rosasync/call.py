@@ -16,7 +16,8 @@ __all__ = ["Call"]
 NOT_SENT = 0
 """Not a valid sequence number: rcl counts from 1."""
 TIMED = 16
-"""One request of this many is timed: to time each would make every call more expensive."""
+"""The first requests are timed, and then one of this many: to time each would make every call more
+expensive."""
 
 
 class Call:
@@ -84,7 +85,7 @@ class Call:
         counts.sent += 1
         client.unanswered[sequence_number] = self
         self._sequence_number = sequence_number
-        if sequence_number % TIMED == 1:
+        if sequence_number < TIMED or not sequence_number % TIMED:
             client.time_response(sequence_number)
         if self.attempts is not None:
             self.attempts.begin(self, client, sequence_number)

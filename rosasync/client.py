@@ -311,7 +311,9 @@ class Client:
         self._superseded[sequence_number] = timer
 
     def time_response(self, sequence_number: int) -> None:
-        """Measure the response time of the request that was just sent."""
+        """Measure the response time of the request just sent, unless another is being measured."""
+        if self._timed in self.unanswered:
+            return
         self._timed = sequence_number
         self._timed_at = self._loop.time()
 

@@ -114,8 +114,10 @@ class Limits:
         waiting: the maximum number of callers that wait for each service; further callers get
             `PoolFull`.
         idle: seconds after which an unused client is destroyed.
-        grace: seconds for which a cancelled or timed-out request counts as outstanding, unless its
-            late response arrives sooner. It may still be in the server's queue.
+        grace: the maximum number of seconds for which a cancelled or timed-out request counts as
+            outstanding, because it may still be in the server's queue. It ends sooner if its late
+            response or the response to a later request arrives, if its server is gone, or if
+            callers wait and no response arrives for some time.
         server_depth: the depth of the server's queue, which all clients of the name share; a larger
             ``in_flight`` says that it is deeper. None if it is deep enough for all of them, so that
             each may use its whole ``in_flight``.
@@ -156,14 +158,18 @@ class Limits:
 class Retry:
     """When to send an unanswered request again; only for services that may run twice.
 
-    The first response to any attempt wins. The deadline still covers the whole call.
+    It is sent again after a delay, at once if three later requests of the same client were
+    answered, or at once to the next server if its servers have vanished. The first response to any
+    attempt wins. The deadline still covers the whole call.
 
     Attributes:
-        attempts: the maximum number of times the request is sent, including the first.
-        after: seconds to wait for a response before the second attempt.
+        attempts: the maximum number of times the request is sent, including the first. They start
+            anew with the next server, unless this is 1.
+        after: seconds to wait for a response before the second attempt. Each delay is longer at
+            random, by up to a quarter.
         backoff: the factor by which this wait grows with each further attempt.
         budget: how many requests of the service may be sent again for each call, 0.2 for one in
-            five. Ten a second may be sent again besides. Unlimited if it is ``math.inf``.
+            five. Ten a second may be sent again besides. ``math.inf`` is no limit.
 
     Raises:
         TypeError: a value is not a number.

@@ -10,8 +10,6 @@ PATIENCE_MIN = 0.2
 """Minimum number of seconds of patience. A busy machine may stop a server that long."""
 MULTIPLE = 4
 """Patience in response times."""
-FALL = 1 / 2
-"""Weight of a response that was faster than the estimate."""
 RISE = 1 / 16
 """Weight of a response that was slower than the estimate."""
 
@@ -19,10 +17,13 @@ RISE = 1 / 16
 class ResponseTimes:
     """Estimates the response time of one client's server, and derives the patience from it.
 
-    This is the retransmission timer of TCP (RFC 6298) with two differences. A slow response weighs
-    less than a fast one: DDS repairs a loss only after up to three seconds, so a mean would make a
-    client most patient on the networks that lose most. And no response is ambiguous (Karn's rule),
-    because each attempt of a retried call has a sequence number of its own.
+    The patience has the part of TCP's retransmission timeout (RFC 6298), but not its estimate: it
+    is a multiple of the lowest response time, which each slower response raises by a sixteenth of
+    the difference. DDS repairs a loss only after up to three seconds, so a mean would make a client
+    most patient on the networks that lose most. The lowest is enough, because each answer begins
+    the wait again: it has to cover the time between two answers of a busy server, and not the time
+    that a request spends in the queue. No response is ambiguous (Karn's rule), because each attempt
+    of a retried call has a sequence number of its own.
 
     Attributes:
         patience: seconds without any answer after which a request is more likely lost than queued.
@@ -31,14 +32,11 @@ class ResponseTimes:
     __slots__ = ("_estimate", "patience")
 
     def __init__(self) -> None:
-        self._estimate: float | None = None
         self.patience = PATIENCE_INITIAL
+        self._estimate = PATIENCE_INITIAL / MULTIPLE
 
     def add(self, seconds: float) -> None:
         """Take a response time into account."""
-        if self._estimate is None:
-            self._estimate = seconds
-        else:
-            weight = RISE if seconds > self._estimate else FALL
-            self._estimate += weight * (seconds - self._estimate)
+        slower = seconds - self._estimate
+        self._estimate += slower * RISE if slower > 0 else slower
         self.patience = max(PATIENCE_MIN, MULTIPLE * self._estimate)

@@ -137,8 +137,8 @@ def test_every_whole_number_is_a_limit() -> None:
     )
     assert limits == Limits(2, 3, 4, 1.5, 0.5)
     assert [type(value) for value in (limits.clients, limits.idle)] == [int, float]
-    retry = Retry(np.int8(2), np.float16(0.5), np.float32(1))  # type: ignore[arg-type]
-    assert retry == Retry(2, 0.5, 1.0)
+    retry = Retry(np.int8(2), np.float16(0.5), np.float32(1), np.float32(0.5))  # type: ignore[arg-type]
+    assert retry == Retry(2, 0.5, 1.0, 0.5)
 
 
 @pytest.mark.parametrize("value", [2.0, np.float64(2), True, np.bool_(True), "2", None])

@@ -43,7 +43,7 @@ class Run:
             in_flight=choose.choice([1, 1, 2, 10]),
             waiting=choose.choice([0, 3, 50, 10_000]),
             idle=choose.choice([0.0, SHORT, 4 * SHORT, 300.0]),
-            grace=choose.choice([0.0, SHORT, 6 * SHORT, 100.0]),
+            grace=choose.choice([0.0, SHORT, 6 * SHORT, 40 * SHORT]),
             server_depth=choose.choice([1, 10, None]),
         )
         self.graph = FakeGraph(graph_events=choose.random() < 0.6)
@@ -102,7 +102,7 @@ class Run:
             Echo.Request(number),
             timeout=self.seconds(),
             wait=wait,
-            retry=self.retry(0.15),
+            retry=self.retry(0.3),
         )
 
     def call(self, number: int) -> asyncio.Task[Any]:
