@@ -8,7 +8,7 @@ import subprocess
 from contextlib import ExitStack
 from types import TracebackType
 
-__all__ = ["Hosts", "NoHosts"]
+__all__ = ["ENVIRONMENT", "Hosts", "NoHosts", "run_ip"]
 
 ENVIRONMENT = {
     "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",
@@ -41,16 +41,16 @@ class Hosts:
             raise NoHosts("network namespaces need root")
         with self._stack:
             for name in self._names:
-                _ip("netns", "add", name)
-                self._stack.callback(_ip, "netns", "delete", name)
+                run_ip("netns", "add", name)
+                self._stack.callback(run_ip, "netns", "delete", name)
             server, client = self._names
             cable = ["type", "veth", "peer", "name", "eth0", "netns", client]
-            _ip("link", "add", "eth0", "netns", server, *cable)
+            run_ip("link", "add", "eth0", "netns", server, *cable)
             for number, name in enumerate(self._names, 1):
-                _ip("-n", name, "address", "add", f"10.0.0.{number}/24", "dev", "eth0")
+                run_ip("-n", name, "address", "add", f"10.0.0.{number}/24", "dev", "eth0")
                 for link in ("lo", "eth0"):
-                    _ip("-n", name, "link", "set", link, "up")
-                _ip("-n", name, "route", "add", "224.0.0.0/4", "dev", "eth0")
+                    run_ip("-n", name, "link", "set", link, "up")
+                run_ip("-n", name, "route", "add", "224.0.0.0/4", "dev", "eth0")
             self._stack = self._stack.pop_all()
         return self
 
@@ -73,7 +73,8 @@ class Hosts:
         return ["ip", "netns", "exec", self._names[1]]
 
 
-def _ip(*arguments: str) -> None:
+def run_ip(*arguments: str) -> None:
+    """Run ``ip``; raise NoHosts if it fails."""
     done = subprocess.run(["ip", *arguments], capture_output=True, text=True, check=False)
     if done.returncode:
         raise NoHosts(f"`ip {' '.join(arguments)}` failed: {done.stderr.strip()}")

@@ -1,0 +1,63 @@
+"""benchmarks.lossy: the hosts reach each other, lose packets as told, and leave nothing behind."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchmarks.hosts import NoHosts
+from benchmarks.lossy import LossyHosts
+
+PACKETS = 400
+ECHO = """
+import socket, sys
+server = socket.socket(type=socket.SOCK_DGRAM)
+server.bind(("", 7))
+print("ready", flush=True)
+while True:
+    data, sender = server.recvfrom(2000)
+    server.sendto(data, sender)
+"""
+ASK = """
+import socket, sys
+client, back = socket.socket(type=socket.SOCK_DGRAM), 0
+client.settimeout(0.2)
+for _ in range(int(sys.argv[2])):
+    client.sendto(b"x", (sys.argv[1], 7))
+    try:
+        back += client.recv(10) == b"x"
+    except TimeoutError:
+        pass
+print(back)
+"""
+
+
+def ask(hosts: LossyHosts, host: str, packets: int) -> int:
+    """Return how many packets came back from the server."""
+    address = hosts.address("server")
+    command = [*hosts.on(host), sys.executable, "-c", ASK, address, str(packets)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    return int(done.stdout)
+
+
+def test_three_hosts() -> None:
+    try:
+        with LossyHosts("server", "one", "two", seed=1) as hosts:
+            spaces = [Path("/run/netns", hosts.namespace(n)) for n in ("server", "one", "two")]
+            assert all(space.exists() for space in spaces)
+            command = [*hosts.on("server"), sys.executable, "-c", ECHO]
+            with subprocess.Popen(command, stdout=subprocess.PIPE) as server:
+                assert server.stdout is not None
+                assert server.stdout.readline() == b"ready\n"
+                assert ask(hosts, "one", PACKETS) == ask(hosts, "two", PACKETS) == PACKETS
+                assert hosts.counts()["lost"] == 0
+                hosts.set(loss=0.2)
+                assert ask(hosts, "one", 40) < 40
+                assert hosts.counts()["lost"] > 0
+                server.terminate()
+    except NoHosts as exc:
+        pytest.skip(str(exc))
+    assert not any(space.exists() for space in spaces)
