@@ -10,6 +10,7 @@ from tests.conftest import Bridge
 from tests.support.program import run_program
 from tests.support.servers import ServerProcess
 
+
 @pytest.mark.usefixtures("echo")
 class TestLeftOpen:
     """An unclosed session warns, and ends with the interpreter."""

@@ -15,7 +15,9 @@ from tests.support.servers import ServerProcess
 
 
 @pytest.fixture(
-    autouse=True, params=[False, pytest.param(True, marks=pytest.mark.faults)], ids=["short", "full"]
+    autouse=True,
+    params=[False, pytest.param(True, marks=pytest.mark.faults)],
+    ids=["short", "full"],
 )
 def full(request: pytest.FixtureRequest) -> bool:
     """Whether this is the full form, which ``-m faults`` selects."""

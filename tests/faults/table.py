@@ -78,7 +78,9 @@ def render(rows: Iterable[Row]) -> Iterator[str]:
     lines = [HEADINGS, *(row.cells for row in rows), _total(rows).cells]
     widths = [max(len(line[column]) for line in lines) for column in range(len(HEADINGS))]
     yield _line(HEADINGS, widths)
-    rules = ["-" * width if n in TEXT else "-" * (width - 1) + ":" for n, width in enumerate(widths)]
+    rules = [
+        "-" * width if n in TEXT else "-" * (width - 1) + ":" for n, width in enumerate(widths)
+    ]
     yield _line(rules, widths)
     for line in lines[1:]:
         yield _line(line, widths)

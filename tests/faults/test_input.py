@@ -183,7 +183,9 @@ def test_mappings(full: bool) -> None:
         how = asyncio.run(Answered().call(request, timeout=LIMIT))
         assert how in ("answered", "refused")
         if how == "answered":
-            assert request is None or request == {} or isinstance(request["data"], bool | numpy.bool_)
+            assert (
+                request is None or request == {} or isinstance(request["data"], bool | numpy.bool_)
+            )
 
     check()
 

@@ -163,6 +163,7 @@ if __name__ == "__main__":
     asyncio.run(main())
 """
 
+
 @pytest.mark.usefixtures("echo")
 async def test_a_program_that_forks(trial: Trial) -> None:
     await _run(trial, FORKING, {0})

@@ -30,9 +30,7 @@ async def test_10000_callers(trial: Trial, server: ServerProcess, full: bool) ->
     assert not trial.failed
 
 
-async def test_one_caller_beyond_the_limit(
-    trial: Trial, server: ServerProcess, full: bool
-) -> None:
+async def test_one_caller_beyond_the_limit(trial: Trial, server: ServerProcess, full: bool) -> None:
     await server.serve("/full", delay="hold")
     waiting = 10_000 if full else 100
     async with trial.session(limits=Limits(waiting=waiting)) as session:
@@ -82,9 +80,7 @@ async def test_the_loop_blocked(trial: Trial, server: ServerProcess, full: bool)
     assert not trial.failed
 
 
-async def test_the_executor_thread_blocked(
-    trial: Trial, server: ServerProcess, full: bool
-) -> None:
+async def test_the_executor_thread_blocked(trial: Trial, server: ServerProcess, full: bool) -> None:
     await server.serve("/echo")
     async with trial.session() as session:
         blocking = 20 * TICK if full else 4 * TICK
@@ -113,9 +109,7 @@ async def test_a_collector_that_always_runs(
     assert not trial.failed
 
 
-async def test_a_flood_of_requests(
-    client_process: ClientProcess, trial: Trial, full: bool
-) -> None:
+async def test_a_flood_of_requests(client_process: ClientProcess, trial: Trial, full: bool) -> None:
     """A flood of one service of a session, beside a healthy caller of another one."""
     overloaded = Holder()
     async with Session("serving", bridge=trial.bridge) as serving, trial.session() as session:
