@@ -56,9 +56,9 @@ class ServiceServer(Generic[RequestT, ResponseT]):
     of the block. If it has no handler, ``async for call in server:`` gives the calls.
 
     At most ``concurrency`` handlers run at a time. Up to ``backlog`` requests, of ``backlog_bytes``
-    in total, wait their turn in the order of their arrival. They wait in Python, because the queue of the middleware would
-    overflow. A plain handler runs in the loop, and blocks it until it returns. An async one runs in
-    a task.
+    in total, wait their turn in the order of their arrival. They wait in Python, because the queue
+    of the middleware would overflow. A plain handler runs in the loop, and blocks it until it
+    returns. An async one runs in a task.
 
     Confined to the loop's thread, except `ServiceCall.respond`: responses are sent from any thread,
     several at once, and the service is destroyed only when none is being sent. rcl does not allow

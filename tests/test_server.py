@@ -150,7 +150,7 @@ class TestLimits:
         sizes = [60, 60, 60, 40, 1]
         tasks = [ask(session, "/served", "x" * size) for size in sizes]
         # The second waits with the fourth; the third and the last do not fit beside them.
-        assert await asyncio.gather(tasks[2], tasks[4]) == ["busy", "busy"]
+        assert [await task for task in (tasks[2], tasks[4])] == ["busy", "busy"]
         assert server.statistics().waiting == 2
         gate.set()
         assert [len(await task) for task in tasks] == [60, 60, 4, 40, 4]

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from typing import Any
 
 import pytest
 
 from rosasync import Session
 from tests.conftest import Bridge
-from tests.faults.table import PROPERTY
+from tests.faults.table import PROPERTY, Row
 from tests.faults.trial import Trial
 from tests.support.servers import ServerProcess
 
@@ -31,8 +31,22 @@ def warm() -> dict[str, bool]:
 
 
 @pytest.fixture
+def record(request: pytest.FixtureRequest) -> Callable[[Row], None]:
+    """Put a row into the report of the test, for the table at the end of the run."""
+
+    def put(row: Row) -> None:
+        request.node.user_properties.append((PROPERTY, row.to_json()))
+
+    return put
+
+
+@pytest.fixture
 async def trial(
-    request: pytest.FixtureRequest, bridge: Bridge, server: ServerProcess, warm: dict[str, bool]
+    request: pytest.FixtureRequest,
+    record: Callable[[Row], None],
+    bridge: Bridge,
+    server: ServerProcess,
+    warm: dict[str, bool],
 ) -> AsyncIterator[Trial]:
     """A trial, with its row in the report of the test. It fails if a figure is not as promised."""
     if bridge not in warm:
@@ -43,8 +57,8 @@ async def trial(
     trial = Trial(fault_of(request), bridge)
     yield trial
     await trial.finish()
-    request.node.user_properties.append((PROPERTY, trial.row.to_json()))
-    trial.check()
+    record(trial.row)
+    trial.row.check()
 
 
 def fault_of(request: pytest.FixtureRequest) -> str:

@@ -9,7 +9,12 @@ from typing import Any, Self
 
 import pytest
 
-__all__ = ["Row", "pytest_terminal_summary", "render"]
+from tests.support.times import LIMIT
+
+__all__ = ["MARGIN", "PROPERTY", "Row", "pytest_terminal_summary", "render"]
+
+MARGIN = LIMIT / 4
+"""Seconds by which a call may overrun its deadline. The table shows how much of it was used."""
 
 PROPERTY = "fault"
 """The user property of a test's report that carries a row."""
@@ -49,6 +54,14 @@ class Row:
     @classmethod
     def from_json(cls, text: str) -> Self:
         return cls(**json.loads(text))
+
+    def check(self) -> None:
+        """Check the figures that every fault must show."""
+        ended = self.answered + self.wrong + sum(self.failed.values())
+        assert self.made == ended + self.hung, self
+        assert (self.wrong, self.hung) == (0, 0), self
+        assert self.late <= MARGIN, self
+        assert not any(self.leaked.values()), self
 
     @property
     def cells(self) -> list[str]:
@@ -114,7 +127,7 @@ def _line(cells: Sequence[str], widths: Sequence[int]) -> str:
 def pytest_terminal_summary(terminalreporter: Any) -> None:
     """Print the rows of all tests; with several processes, the one that collects the reports."""
     rows = {
-        (report.nodeid, value): Row.from_json(value)
+        (report.nodeid, value): Row.from_json(str(value))
         for reports in terminalreporter.stats.values()
         for report in reports
         if isinstance(report, pytest.TestReport)

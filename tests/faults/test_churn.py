@@ -49,14 +49,17 @@ async def test_of_clients_leases_and_servers(
             await session.pool.warm(ECHO, f"/warm_{number}", chance.randint(1, 4))
             await asyncio.sleep(chance.uniform(0, 2 * TICK))
 
-    async with trial.session(limits=limits) as session, asyncio.TaskGroup() as group:
-        async with trial.callers(session, "/echo", 5, timeout=LIMIT):
-            for number in range(3):
-                group.create_task(lease(session))
-                group.create_task(serve(session, number))
-                group.create_task(make_clients(session, number))
-            await asyncio.sleep(60 if full else 20 * TICK)
-            ended.set()
+    async with (
+        trial.session(limits=limits) as session,
+        asyncio.TaskGroup() as group,
+        trial.callers(session, "/echo", 5, timeout=LIMIT),
+    ):
+        for number in range(3):
+            group.create_task(lease(session))
+            group.create_task(serve(session, number))
+            group.create_task(make_clients(session, number))
+        await asyncio.sleep(1_200 * TICK if full else 20 * TICK)
+        ended.set()
     assert not trial.failed
 
 

@@ -148,8 +148,7 @@ class Answered:
         async with self.graph.session(limits=self.limits) as session:
             try:
                 response = await session.call(SetBool, "/lamp", request, **options)
-            except REFUSALS as error:
-                assert str(error)
+            except REFUSALS:
                 assert not self.server.received
                 return "refused"
             except CallError:
@@ -202,8 +201,7 @@ def test_limits_and_retries(full: bool) -> None:
     def check(limits: Any, retry: Any) -> None:
         try:
             checked, again = Limits(**limits), Retry(**retry)
-        except REFUSALS as error:
-            assert str(error)
+        except REFUSALS:
             return
         try:
             how = asyncio.run(Answered(checked).call(timeout=LIMIT, retry=again))

@@ -18,8 +18,8 @@ from tests.support.checks import check_call
 from tests.support.echo import ECHO
 from tests.support.nodes import reports
 from tests.support.program import run_program
-from tests.support.serving import FORMS
 from tests.support.servers import ServerProcess
+from tests.support.serving import FORMS
 from tests.support.times import LIMIT, TICK, until
 
 
@@ -27,13 +27,12 @@ async def test_closed_under_calls(trial: Trial, server: ServerProcess, full: boo
     """Some calls are out then, others wait for a place, for a server, or have just been made."""
     await server.serve("/slow", delay=(0.0, TICK))
     for number in range(100 if full else 8):
-        async with asyncio.TaskGroup() as group:
-            async with trial.session() as session:
-                for name in ("/slow", "/absent"):
-                    group.create_task(trial.calls(session, name, 20, timeout=LIMIT))
-                await asyncio.sleep(number % 8 * TICK / 4)
-                group.create_task(trial.calls(session, "/slow", 5, timeout=LIMIT))
-                await session.aclose()
+        async with asyncio.TaskGroup() as group, trial.session() as session:
+            for name in ("/slow", "/absent"):
+                group.create_task(trial.calls(session, name, 20, timeout=LIMIT))
+            await asyncio.sleep(number % 8 * TICK / 4)
+            group.create_task(trial.calls(session, "/slow", 5, timeout=LIMIT))
+            await session.aclose()
     assert trial.failed.keys() == {"SessionClosed"}
 
 

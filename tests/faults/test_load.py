@@ -162,17 +162,20 @@ async def test_a_flood_of_megabytes(trial: Trial, full: bool) -> None:
 
 
 async def test_peers_that_read_nothing(trial: Trial, full: bool) -> None:
-    """The queue of responses to a stopped process fills; other callers are answered all the same."""
-    async with Session("serving", bridge=trial.bridge) as serving, trial.session() as session:
-        async with serving.serve(ECHO, "/shared", FORMS["async, call"]) as server:
-            async with ClientProcess() as peer:
-                await peer.start("/shared", None, in_flight=8, timeout=4 * TICK)
-                await until(lambda: server.statistics().responded > 20)
-                os.kill(peer.pid, signal.SIGSTOP)
-                for _ in range(100 if full else 10):
-                    await trial.calls(session, "/shared", 10, timeout=2 * LIMIT)
-                os.kill(peer.pid, signal.SIGCONT)
-                await peer.result()
+    """The queue of responses to a stopped process fills; other callers are answered as before."""
+    async with (
+        Session("serving", bridge=trial.bridge) as serving,
+        trial.session() as session,
+        serving.serve(ECHO, "/shared", FORMS["async, call"]) as server,
+        ClientProcess() as peer,
+    ):
+        await peer.start("/shared", None, in_flight=8, timeout=4 * TICK)
+        await until(lambda: server.statistics().responded > 20)
+        os.kill(peer.pid, signal.SIGSTOP)
+        for _ in range(100 if full else 10):
+            await trial.calls(session, "/shared", 10, timeout=2 * LIMIT)
+        os.kill(peer.pid, signal.SIGCONT)
+        await peer.result()
     assert not trial.failed
 
 
