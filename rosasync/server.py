@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Generic, Self
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, Self
 
 from rosasync.aio import until_done
 from rosasync.errors import SessionClosed, UsageError
@@ -33,6 +33,7 @@ from rosasync.service_call import (
     ServiceCall,
     service_destroyed,
 )
+from rosasync.sizes import payload_size
 from rosasync.statistics import ServerStatistics
 from rosasync.typing import RequestT, ResponseT
 
@@ -55,10 +56,10 @@ class ServiceServer(Generic[RequestT, ResponseT]):
     It takes requests as soon as it is created. As an async context manager it is closed at the end
     of the block. If it has no handler, ``async for call in server:`` gives the calls.
 
-    At most ``concurrency`` handlers run at a time. Up to ``backlog`` requests wait their turn, in
-    the order of their arrival. They wait in Python, because the queue of the middleware would
-    overflow. A plain handler runs in the loop, and blocks it until it returns. An async one runs in
-    a task.
+    At most ``concurrency`` handlers run at a time. Up to ``backlog`` requests, of ``backlog_bytes``
+    in total, wait their turn in the order of their arrival. They wait in Python, because the queue
+    of the middleware would overflow. A plain handler runs in the loop, and blocks it until it
+    returns. An async one runs in a task.
 
     Confined to the loop's thread, except `ServiceCall.respond`: responses are sent from any thread,
     several at once, and the service is destroyed only when none is being sent. rcl does not allow
@@ -75,6 +76,7 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         *,
         concurrency: int,
         backlog: int,
+        backlog_bytes: int,
         qos: Any,
         on_error: ErrorHook[RequestT, ResponseT] | None,
         on_overload: OverloadHook[RequestT, ResponseT] | None,
@@ -87,7 +89,9 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         self._on_end = on_end
         self._concurrency = check_count("concurrency", concurrency, 1)
         self._has_handler = kind is not None
-        self._queue = _CallQueue[RequestT, ResponseT](check_count("backlog", backlog, 0))
+        self._queue = _CallQueue[RequestT, ResponseT](
+            check_count("backlog", backlog, 0), check_count("backlog_bytes", backlog_bytes, 0)
+        )
         self._counts = CallCounts()
         self._tasks = HandlerTasks()
         self._taking = True
@@ -361,23 +365,41 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         self.end(functools.partial(SessionClosed, f"{self._name}: the server is closed"))
 
 
+class _Waiting(NamedTuple):
+    """A call that waits.
+
+    Attributes:
+        number: its place in the order of arrival.
+        size: the estimated number of bytes of its request.
+        call: the call.
+    """
+
+    number: int
+    size: int
+    call: ServiceCall[Any, Any]
+
+
 class _CallQueue(Generic[RequestT, ResponseT]):
     """Calls that wait for a handler or an iterator, and iterators that wait for calls.
 
     At most one of the two kinds waits at a time. Confined to the loop's thread.
+
+    Args:
+        limit: the maximum number of calls that wait.
+        limit_bytes: the maximum size of their requests together, unless only one call waits.
     """
 
-    def __init__(self, limit: int) -> None:
+    def __init__(self, limit: int, limit_bytes: int) -> None:
         self._loop = asyncio.get_running_loop()
         self._limit = limit
+        self._limit_bytes = limit_bytes
+        self._bytes = 0
         self._numbers = itertools.count()
         self._closed = False
-        # Each with a number in the order of arrival, by which `_put_back` finds its place.
-        self._calls: deque[tuple[int, ServiceCall[RequestT, ResponseT]]] = deque()
+        # In the order of arrival, in which `_put_back` finds a place.
+        self._calls: deque[_Waiting] = deque()
         # Each is completed with an entry of `_calls`, or with None when the queue is closed.
-        self._getters: deque[
-            asyncio.Future[tuple[int, ServiceCall[RequestT, ResponseT]] | None]
-        ] = deque()
+        self._getters: deque[asyncio.Future[_Waiting | None]] = deque()
 
     def __len__(self) -> int:
         return len(self._calls)
@@ -388,17 +410,24 @@ class _CallQueue(Generic[RequestT, ResponseT]):
         Returns:
             False if the queue is full.
         """
-        entry = next(self._numbers), call
-        if self._hand_out(entry):
+        number = next(self._numbers)
+        if self._getters and self._hand_out(_Waiting(number, 0, call)):
             return True
-        if len(self._calls) >= self._limit:
+        waiting = len(self._calls)
+        if waiting >= self._limit:
             return False
-        self._calls.append(entry)
+        size = payload_size(call.request)
+        if waiting and self._bytes + size > self._limit_bytes:
+            return False
+        self._bytes += size
+        self._calls.append(_Waiting(number, size, call))
         return True
 
     def pop(self) -> ServiceCall[RequestT, ResponseT]:
         """Return the call that waits longest."""
-        return self._calls.popleft()[1]
+        waiting = self._calls.popleft()
+        self._bytes -= waiting.size
+        return waiting.call
 
     async def get(self) -> ServiceCall[RequestT, ResponseT] | None:
         """Wait for a call; None if the queue is closed."""
@@ -406,8 +435,7 @@ class _CallQueue(Generic[RequestT, ResponseT]):
             return self.pop()
         if self._closed:
             return None
-        getter: asyncio.Future[tuple[int, ServiceCall[RequestT, ResponseT]] | None]
-        getter = self._loop.create_future()
+        getter: asyncio.Future[_Waiting | None] = self._loop.create_future()
         self._getters.append(getter)
         try:
             entry = await getter
@@ -422,7 +450,7 @@ class _CallQueue(Generic[RequestT, ResponseT]):
             elif (entry := getter.result()) is not None:
                 self._put_back(entry)
             raise
-        return None if entry is None else entry[1]
+        return None if entry is None else entry.call
 
     def close(self) -> None:
         """End the iterators once no call is left; idempotent."""
@@ -432,7 +460,7 @@ class _CallQueue(Generic[RequestT, ResponseT]):
             if not getter.done() and not self._loop.is_closed():
                 getter.set_result(None)
 
-    def _hand_out(self, entry: tuple[int, ServiceCall[RequestT, ResponseT]]) -> bool:
+    def _hand_out(self, entry: _Waiting) -> bool:
         while self._getters:
             getter = self._getters.popleft()
             if not getter.done():
@@ -440,10 +468,12 @@ class _CallQueue(Generic[RequestT, ResponseT]):
                 return True
         return False
 
-    def _put_back(self, entry: tuple[int, ServiceCall[RequestT, ResponseT]]) -> None:
-        """Pass a call to the next iterator, or put it back in its place, even beyond the limit."""
+    def _put_back(self, entry: _Waiting) -> None:
+        """Pass a call to the next iterator, or put it back in its place, even beyond the limits."""
         if self._closed:
-            entry[1].give_up("dropped: the server was closed")
+            entry.call.give_up("dropped: the server was closed")
         elif not self._hand_out(entry):
-            place = bisect.bisect(self._calls, entry[0], key=lambda waiting: waiting[0])
-            self._calls.insert(place, entry)
+            size = payload_size(entry.call.request)
+            self._bytes += size
+            place = bisect.bisect(self._calls, entry.number, key=lambda waiting: waiting.number)
+            self._calls.insert(place, entry._replace(size=size))

@@ -393,6 +393,7 @@ class Session:
         *,
         concurrency: int = 100,
         backlog: int = 1000,
+        backlog_bytes: int = 64_000_000,
         qos: QoSProfile | None = None,
         on_error: ErrorHook[RequestT, ResponseT] | None = None,
         on_overload: OverloadHook[RequestT, ResponseT] | None = None,
@@ -407,6 +408,7 @@ class Session:
         *,
         concurrency: int = 100,
         backlog: int = 1000,
+        backlog_bytes: int = 64_000_000,
         qos: QoSProfile | None = None,
         on_error: ErrorHook[Any, Any] | None = None,
         on_overload: OverloadHook[Any, Any] | None = None,
@@ -420,6 +422,7 @@ class Session:
         *,
         concurrency: int = 100,
         backlog: int = 1000,
+        backlog_bytes: int = 64_000_000,
         qos: QoSProfile | None = None,
         on_error: ErrorHook[Any, Any] | None = None,
         on_overload: OverloadHook[Any, Any] | None = None,
@@ -445,6 +448,8 @@ class Session:
                 registration. A plain handler blocks the loop while it runs.
             concurrency: the maximum number of handlers that run at a time.
             backlog: the maximum number of requests that wait for a handler.
+            backlog_bytes: the maximum size of these requests together, in bytes. A single request
+                may be larger.
             qos: a ``QoSProfile``; None for the service default with a history of 1,000.
             on_error: ``on_error(call, error)``, plain or async, called when the handler has raised
                 an exception or returned something other than a response. It may return the response
@@ -467,6 +472,7 @@ class Session:
             handler,
             concurrency=concurrency,
             backlog=backlog,
+            backlog_bytes=backlog_bytes,
             qos=qos,
             on_error=on_error,
             on_overload=on_overload,

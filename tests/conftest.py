@@ -16,9 +16,12 @@ import uvloop
 
 from rosasync import Session
 from rosasync.ros.domain import isolate
+from tests.faults.table import pytest_terminal_summary
 from tests.support.clients import ClientProcess
 from tests.support.servers import ServerProcess
 from tests.support.times import LIMIT
+
+__all__ = ["pytest_terminal_summary"]
 
 isolate()
 
@@ -31,6 +34,15 @@ with warnings.catch_warnings():
     importlib.import_module("rosidl_generator_py")
 
 Bridge = Literal["direct", "executor"]
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--soak-minutes",
+        type=float,
+        default=1.0,
+        help="minutes for which the soak of tests/faults runs on each bridge",
+    )
 
 
 def pytest_asyncio_loop_factories(

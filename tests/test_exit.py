@@ -2,57 +2,13 @@
 
 from __future__ import annotations
 
-import asyncio
 import signal
-import subprocess
-import sys
 
 import pytest
 
 from tests.conftest import Bridge
-from tests.support.process import ROOT
+from tests.support.program import run_program
 from tests.support.servers import ServerProcess
-from tests.support.times import LIMIT
-
-BEGINNING = """
-import asyncio, sys, warnings
-from rosasync import Session
-from tests.support.checks import check_call
-
-async def opened(bridge):
-    session = Session("left_open", bridge=bridge)
-    await session.__aenter__()
-    await check_call(session, "/echo", "text")
-    print("called", flush=True)
-    return session
-
-bridge = sys.argv[1]
-"""
-
-
-async def run(bridge: Bridge, program: str, send: int | None = None) -> tuple[int, str]:
-    """Run a program to its end; return its exit code and its stderr."""
-    process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-W", "default::ResourceWarning", "-c", BEGINNING + program, bridge),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        cwd=ROOT,
-    )
-    assert process.stdout is not None
-    try:
-        async with asyncio.timeout(2 * LIMIT):
-            assert await process.stdout.readline() == b"called\n"
-            if send is not None:
-                process.send_signal(send)
-            _, errors = await process.communicate()
-    finally:
-        if process.returncode is None:
-            process.kill()
-            await process.wait()
-    assert process.returncode is not None
-    text = errors.decode()
-    assert "terminate called" not in text
-    return process.returncode, text
 
 
 @pytest.mark.usefixtures("echo")
@@ -60,13 +16,13 @@ class TestLeftOpen:
     """An unclosed session warns, and ends with the interpreter."""
 
     async def test_held_by_the_program(self, bridge: Bridge) -> None:
-        code, errors = await run(bridge, "session = asyncio.run(opened(bridge))")
+        code, errors = await run_program(bridge, "session = asyncio.run(opened(bridge))")
         assert code == 0, errors
         assert f"ResourceWarning: unclosed <Session 'left_open' {bridge} bridge" in errors
         assert "Traceback" not in errors
 
     async def test_dropped_by_the_program(self, bridge: Bridge) -> None:
-        code, errors = await run(bridge, "asyncio.run(opened(bridge))")
+        code, errors = await run_program(bridge, "asyncio.run(opened(bridge))")
         assert code == 0, errors
         assert f"ResourceWarning: unclosed <Session 'left_open' {bridge} bridge" in errors
         assert "Traceback" not in errors
@@ -83,7 +39,7 @@ async def main():
         await check_call(session, "/echo", "text")
 asyncio.run(main())
 """
-        code, errors = await run(bridge, program)
+        code, errors = await run_program(bridge, program)
         assert code == 0, errors
         assert "ResourceWarning: unclosed <Session" in errors
         assert "Traceback" not in errors
@@ -98,7 +54,7 @@ async def main():
     await asyncio.sleep(0.1)
 asyncio.run(main())
 """
-        code, errors = await run(bridge, program)
+        code, errors = await run_program(bridge, program)
         assert code == 0, errors
         assert "ResourceWarning: unclosed <Session" in errors
 
@@ -116,7 +72,7 @@ async def main():
         raise SystemExit(7)
 asyncio.run(main())
 """
-        code, errors = await run(bridge, program)
+        code, errors = await run_program(bridge, program)
         assert code == 7, errors
         assert "ResourceWarning" not in errors
 
@@ -133,7 +89,7 @@ async def main():
         await task
 asyncio.run(main())
 """
-        code, errors = await run(bridge, program, signal.SIGINT)
+        code, errors = await run_program(bridge, program, signal.SIGINT)
         assert code in (130, -signal.SIGINT), errors
         assert "KeyboardInterrupt" in errors
         assert "ResourceWarning" not in errors
@@ -156,7 +112,7 @@ loop.run_until_complete(send_and_give_up())
 loop.close()
 time.sleep(0.5)
 """
-        code, errors = await run(bridge, program)
+        code, errors = await run_program(bridge, program)
         assert code == 0, errors
         assert "ResourceWarning: unclosed <Session" in errors
         assert "Traceback" not in errors
@@ -169,6 +125,6 @@ async def main():
     await session.aclose()
 asyncio.run(main())
 """
-        code, errors = await run(bridge, program)
+        code, errors = await run_program(bridge, program)
         assert code == 0, errors
         assert errors == ""

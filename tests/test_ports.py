@@ -161,7 +161,7 @@ async def test_nothing_comes_after_close(world: World) -> None:
 
 async def test_names_are_resolved_or_refused(world: World) -> None:
     assert world.node.describe(ECHO, "port_echo", None).key.srv_name == "/port_echo"
-    for name in ("", "/", "/with space", "/1st", "/double//slash"):
+    for name in ("", "/", "/with space", "/1st", "/double//slash", "/\ud800"):
         with pytest.raises(InvalidServiceName, match="service name"):
             world.node.describe(ECHO, name, None)
 

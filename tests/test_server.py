@@ -48,6 +48,8 @@ async def test_other_bad_arguments(session: Session) -> None:
         session.serve(ECHO, "/bad", echo_call, concurrency=0)
     with pytest.raises(ValueError, match="backlog"):
         session.serve(ECHO, "/bad", echo_call, backlog=-1)
+    with pytest.raises(ValueError, match="backlog_bytes"):
+        session.serve(ECHO, "/bad", echo_call, backlog_bytes=-1)
     with pytest.raises(TypeError, match="qos"):
         session.serve(ECHO, "/bad", echo_call, qos=10)
     with pytest.raises(InvalidServiceName):
@@ -131,6 +133,34 @@ class TestLimits:
         await settled(server)
         assert server.statistics().responded == 2
         await discard(*tasks[2:])
+
+    async def test_beyond_the_backlog_in_bytes(self, session: Session) -> None:
+        gate = asyncio.Event()
+
+        async def handler(call: AnyCall) -> Any:
+            await gate.wait()
+            return echo_of(call.request)
+
+        def busy(call: AnyCall) -> Any:
+            return Response(message="busy")
+
+        server = session.serve(
+            ECHO, "/served", handler, concurrency=1, backlog_bytes=100, on_overload=busy
+        )
+        sizes = [60, 60, 60, 40, 1]
+        tasks = [ask(session, "/served", "x" * size) for size in sizes]
+        # The second waits with the fourth; the third and the last do not fit beside them.
+        assert [await task for task in (tasks[2], tasks[4])] == ["busy", "busy"]
+        assert server.statistics().waiting == 2
+        gate.set()
+        assert [len(await task) for task in tasks] == [60, 60, 4, 40, 4]
+        # Of a single request that waits, the size does not matter.
+        gate.clear()
+        tasks = [ask(session, "/served", "x" * size) for size in (1, 1_000)]
+        await until(lambda: server.statistics().waiting == 1)
+        gate.set()
+        assert [len(await task) for task in tasks] == [1, 1_000]
+        assert server.statistics().rejected == 2
 
     async def test_an_on_overload_that_raises(
         self, session: Session, caplog: pytest.LogCaptureFixture

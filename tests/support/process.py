@@ -10,11 +10,12 @@ import asyncio
 import json
 import os
 import select
+import signal
 import subprocess
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
@@ -71,19 +72,27 @@ class Child:
 
     Args:
         lease: seconds after which other processes notice that this one was killed.
+        prefix: the beginning of its command line, such as one that enters a network namespace.
+        environment: environment variables beside those of this process.
     """
 
     module: str
 
-    def __init__(self, *args: str, lease: int = 20) -> None:
+    def __init__(
+        self,
+        *args: str,
+        lease: int = 20,
+        prefix: Sequence[str] = (),
+        environment: Mapping[str, str] | None = None,
+    ) -> None:
         self._lock = threading.Lock()
-        with profile(lease) as environment:
+        with profile(lease) as variables:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", self.module, *args],
+                [*prefix, sys.executable, "-m", self.module, *args],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 cwd=ROOT,
-                env=os.environ | environment,
+                env=os.environ | variables | dict(environment or {}),
             )
             self.ask_now("ready")
 
@@ -127,6 +136,11 @@ class Child:
         self._reap()
         for file in leftovers:
             file.unlink(missing_ok=True)
+
+    def interrupt(self) -> None:
+        """End it as Ctrl-C does (SIGINT), which rclpy's signal handlers do not see here."""
+        self._process.send_signal(signal.SIGINT)
+        self.close()
 
     def close(self) -> None:
         """Ask it to end by closing its stdin, and wait for that; kill it if it does not end."""
@@ -184,6 +198,9 @@ def serve_commands(commands: Mapping[str, Callable[..., Any]]) -> None:
             keyword, and its return value is sent to the parent as JSON.
     """
     commands = {"ready": lambda: None, **commands}
+    # The middleware logs its errors to stdout; they belong to stderr then.
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)
     for line in sys.stdin.buffer:
         message = json.loads(line)
         try:
@@ -191,7 +208,7 @@ def serve_commands(commands: Mapping[str, Callable[..., Any]]) -> None:
         except Exception:
             answer = {"error": traceback.format_exc()}
         try:
-            sys.stdout.write(json.dumps(answer) + "\n")
-            sys.stdout.flush()
+            answers.write(json.dumps(answer) + "\n")
+            answers.flush()
         except BrokenPipeError:
             return

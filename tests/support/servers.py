@@ -7,6 +7,7 @@ wants a response late, in another order or never, only sending it is put off.
 from __future__ import annotations
 
 import asyncio
+import ctypes
 import heapq
 import itertools
 import os
@@ -25,13 +26,17 @@ from tests.support.echo import ECHO, fill, response_to, service_class
 from tests.support.process import Child, profile, serve_commands
 from tests.support.times import LIMIT
 
-__all__ = ["Delay", "ServerProcess", "running"]
+__all__ = ["Delay", "Misbehaviour", "ServerProcess", "running"]
 
 T = TypeVar("T")
 
 Delay = float | tuple[float, float] | Literal["hold", "never"] | None
 """When a request is answered: at once (None), after a number of seconds, after a random number of
 seconds between two, when `ServerProcess.release` is called, or never."""
+
+Misbehaviour = Literal["twice", "thrice", "forging", "every second"] | None
+"""What a server does wrong: it answers each request twice or thrice, or only every second one, or
+it precedes each answer by others under the numbers of earlier requests and of none."""
 
 
 @contextmanager
@@ -71,6 +76,7 @@ class ServerProcess(Child):
         skip: int = 0,
         depth: int | None = None,
         copies: int = 1,
+        wrong: Misbehaviour = None,
     ) -> None:
         """Create a service, and return when it exists.
 
@@ -81,6 +87,7 @@ class ServerProcess(Child):
             skip: how many requests to leave unanswered at first.
             depth: the depth of its history; None for the default of ROS, 10.
             copies: how many services to create under this name.
+            wrong: what it does wrong.
         """
         self.ask_now(
             "serve",
@@ -90,6 +97,7 @@ class ServerProcess(Child):
             skip=skip,
             depth=depth,
             copies=copies,
+            wrong=wrong,
         )
 
     async def stop(self, name: str) -> None:
@@ -146,8 +154,9 @@ class _Later:
 class _Service:
     """A service name of the process: its rclpy services, when they answer, and its counts."""
 
-    def __init__(self, delay: Delay, skip: int, later: _Later) -> None:
+    def __init__(self, delay: Delay, skip: int, later: _Later, wrong: Misbehaviour) -> None:
         self.delay = delay
+        self.wrong = wrong
         self.received: list[str] = []
         self.answered = 0
         self.services: list[Any] = []
@@ -188,10 +197,37 @@ class _Service:
         from rclpy.exceptions import InvalidHandle
 
         with suppress(InvalidHandle):
-            send(response, header)
+            if self.wrong == "forging":
+                self._forge(send, response, header)
+            times = {"twice": 2, "thrice": 3, "every second": len(self.received) % 2}
+            for _ in range(times.get(self.wrong or "", 1)):
+                send(response, header)
             with self.changed:
                 self.answered += 1
                 self.changed.notify_all()
+
+    def _forge(self, send: Callable[[Any, Any], None], response: Any, header: Any) -> None:
+        """Send a wrong response under numbers that nobody waits for."""
+        forged = type(response)(message="forged")
+        identity = header.request_id
+        number = _number_of(identity)
+        true = number.value
+        for other in (true - 1, true - 5, true + 1000, 0, -1, 2**63 - 1):
+            number.value = other
+            send(forged, identity)
+        number.value = true
+
+
+def _number_of(identity: Any) -> ctypes.c_int64:
+    """Return the sequence number in an ``rmw_request_id_t``, which rclpy does not let one set.
+
+    pybind11 keeps the address of a C++ object behind the head of the Python object.
+    """
+    address = ctypes.c_void_p.from_address(id(identity) + object.__basicsize__).value
+    assert address is not None
+    number = ctypes.c_int64.from_address(address + 16)
+    assert number.value == identity.sequence_number
+    return number
 
 
 class _Servers:
@@ -208,13 +244,20 @@ class _Servers:
         return {name: getattr(self, name) for name in names}
 
     def serve(
-        self, name: str, srv_type: str, delay: Delay, skip: int, depth: int | None, copies: int
+        self,
+        name: str,
+        srv_type: str,
+        delay: Delay,
+        skip: int,
+        depth: int | None,
+        copies: int,
+        wrong: Misbehaviour,
     ) -> None:
         from rclpy.qos import QoSProfile, qos_profile_services_default
 
         qos = qos_profile_services_default if depth is None else QoSProfile(depth=depth)
         kept = self._services.get(name)
-        service = kept or _Service(delay, skip, self._later)
+        service = kept or _Service(delay, skip, self._later, wrong)
         service.delay = delay
         self._services[name] = service
 

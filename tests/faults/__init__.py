@@ -1,0 +1,1 @@
+"""Faults, each with the figures that its calls must show: `python -m pytest -m faults`."""

@@ -1,0 +1,242 @@
+"""Any order of events on one service of the graph in memory, in virtual time.
+
+A loop whose clock only moves when nothing else is left to do, and a server that answers only when
+it is told: so hypothesis decides the order of everything, and can shorten a failure.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import selectors
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+from hypothesis.stateful import run_state_machine_as_test as run_machine
+
+from rosasync import Limits, Retry, RosasyncError
+from rosasync.service_pool import ServicePool
+from rosasync.testing import FakeGraph, FakeServer
+from tests.support.plain import Echo, echo
+
+MOST = 100.0
+"""Virtual seconds after which nothing can be left: more than all deadlines and grace periods."""
+
+
+class VirtualSelector(selectors.DefaultSelector):
+    """Waits for nothing: where a loop would sleep, its clock moves instead."""
+
+    now = 0.0
+
+    def select(self, timeout: float | None = None) -> Any:
+        ready = super().select(0)
+        if not ready and timeout:
+            self.now += timeout
+        return ready
+
+
+class VirtualLoop(asyncio.SelectorEventLoop):
+    """A loop in virtual time."""
+
+    def __init__(self) -> None:
+        self.clock = VirtualSelector()
+        super().__init__(self.clock)
+
+    def time(self) -> float:
+        return self.clock.now
+
+
+class ManualServer(FakeServer):
+    """Keeps its requests, and answers one when it is told."""
+
+    def __init__(self, graph: FakeGraph, on_request: Callable[[int], None]) -> None:
+        super().__init__(graph, Echo, "/echo", echo)
+        self._on_request = on_request
+
+    def receive(self, client: Any, number: int, request: Any) -> None:
+        self._on_request(request.value)
+        self.received.append((client, number, request))
+
+    def answer(self, place: int) -> None:
+        client, number, request = self.received.pop(place % len(self.received))
+        client.later(0.0, number, echo(request))
+
+
+SECONDS = st.sampled_from([None, 0.0, 0.5, 2.0, 10.0])
+
+
+class Races(RuleBasedStateMachine):
+    """One session, one service, and what must hold whatever happens to it."""
+
+    limits = Limits()
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.loop = VirtualLoop()
+        self.reported: list[dict[str, Any]] = []
+        self.loop.set_exception_handler(lambda _, context: self.reported.append(context))
+        self.graph = FakeGraph()
+        self.servers: list[ManualServer] = []
+        self.tasks: dict[int, asyncio.Task[Any]] = {}
+        self.in_line: set[int] = set()
+        self.sent: dict[int, None] = {}
+        self.leases = 0
+        self.made = 0
+        self.session = self.graph.session(limits=self.limits, timeout=None)
+        self._run(self.session.__aenter__())
+        pool = self.session.pool
+        self.service: ServicePool = self._run(self._do(pool.service, Echo, "/echo", None))
+        self.come()
+
+    async def _do(self, function: Callable[..., Any], *args: Any) -> Any:
+        return function(*args)
+
+    def _run(self, work: Any) -> Any:
+        return self.loop.run_until_complete(work)
+
+    async def _turns(self, count: int) -> None:
+        for _ in range(count):
+            await asyncio.sleep(0)
+
+    @rule(timeout=SECONDS, wait=st.booleans(), retry=st.booleans(), lease=st.booleans())
+    def call(self, timeout: float | None, wait: bool, retry: bool, lease: bool) -> None:
+        number, self.made = self.made, self.made + 1
+        again = Retry(3, 1.0, 1.0) if retry else None
+        self.leases += lease
+        if lease:
+            work = self._leased(number, timeout, again)
+        else:
+            request = Echo.Request(number)
+            work = self.session.call(
+                Echo, "/echo", request, timeout=timeout, wait=wait, retry=again
+            )
+        self.tasks[number] = self.loop.create_task(work)
+        if wait and not lease:
+            self.in_line.add(number)
+        self._run(self._turns(0))
+
+    def _sent(self, number: int) -> None:
+        self.sent.setdefault(number)
+
+    async def _leased(self, number: int, timeout: float | None, retry: Retry | None) -> Any:
+        async with self.session.pool.lease(Echo, "/echo", timeout=timeout) as client:
+            return await client.call(Echo.Request(number), timeout=timeout, retry=retry)
+
+    @precondition(lambda self: any(server.received for server in self.servers))
+    @rule(which=st.integers(0, 100), place=st.integers(0, 100))
+    def respond(self, which: int, place: int) -> None:
+        servers = [server for server in self.servers if server.received]
+        self._run(self._do(servers[which % len(servers)].answer, place))
+
+    @precondition(lambda self: self.tasks)
+    @rule(which=st.integers(0, 100))
+    def cancel(self, which: int) -> None:
+        list(self.tasks.values())[which % len(self.tasks)].cancel()
+
+    @rule(count=st.integers(1, 5))
+    def turn(self, count: int) -> None:
+        self._run(self._turns(count))
+
+    @rule(seconds=st.sampled_from([0.1, 0.6, 2.5, 11.0]))
+    def pass_time(self, seconds: float) -> None:
+        self._run(asyncio.sleep(seconds))
+
+    @precondition(lambda self: len(self.servers) < 2)
+    @rule()
+    def come(self) -> None:
+        server = ManualServer(self.graph, self._sent)
+        self.servers.append(server)
+        self.graph.servers.append(server)
+        self._run(self._do(self.graph.changed))
+
+    @precondition(lambda self: self.servers)
+    @rule(which=st.integers(0, 1))
+    def leave(self, which: int) -> None:
+        server = self.servers.pop(which % len(self.servers))
+        self.graph.servers.remove(server)
+        self._run(self._do(self.graph.changed))
+
+    @rule()
+    def close(self) -> None:
+        self._run(self.session.aclose())
+        self._run(self._turns(3))
+        assert all(task.done() for task in self.tasks.values())
+
+    @invariant()
+    def places_are_neither_lost_nor_doubled(self) -> None:
+        for client in self.service.clients:
+            assert 0 <= client.leases <= self.limits.in_flight
+        assert len(self.service.clients) <= self.limits.clients
+        statistics = self.service.statistics()
+        assert statistics.in_flight >= 0
+        assert statistics.abandoned >= 0
+        assert statistics.in_flight + statistics.abandoned <= max(
+            statistics.window, self.limits.in_flight * self.limits.clients
+        )
+
+    @invariant()
+    def first_come_first_served(self) -> None:
+        in_order = [number for number in self.sent if number in self.in_line]
+        assert in_order == sorted(in_order)
+
+    @invariant()
+    def nothing_is_reported(self) -> None:
+        """Completing a future twice would be an InvalidStateError, here or in a callback."""
+        assert self.reported == []
+
+    @invariant()
+    def every_answer_is_its_own(self) -> None:
+        for number, task in self.tasks.items():
+            if task.done() and not task.cancelled():
+                error = task.exception()
+                assert error is None or isinstance(error, RosasyncError), error
+                assert error is not None or task.result().value == number
+
+    def teardown(self) -> None:
+        if not self.session.closed:
+            for task in self.tasks.values():
+                task.cancel()
+            self._run(asyncio.sleep(MOST))
+            statistics = self.service.statistics()
+            assert (statistics.in_flight, statistics.waiting, statistics.abandoned) == (0, 0, 0)
+            assert all(client.leases == 0 for client in self.service.clients)
+            ended = statistics.completed + statistics.timed_out
+            ended += statistics.cancelled + statistics.failed
+            # The wait for a lease is not counted.
+            assert ended <= self.made if self.leases else ended == self.made
+        self._run(self.session.aclose())
+        self._run(self._turns(3))
+        assert all(task.done() for task in self.tasks.values())
+        self.nothing_is_reported()
+        self.every_answer_is_its_own()
+        self.loop.close()
+
+
+class ExclusiveRaces(Races):
+    """The same with clients that carry one request at a time."""
+
+    limits = Limits(clients=3, in_flight=1, waiting=5, grace=1.0, idle=2.0)
+
+
+class NarrowRaces(Races):
+    """The same with a single place and no grace period."""
+
+    limits = Limits(clients=1, in_flight=1, grace=0.0)
+
+
+@pytest.mark.parametrize("machine", [Races, ExclusiveRaces, NarrowRaces])
+def test_in_any_order(machine: type[Races], full: bool) -> None:
+    run_machine(
+        machine,
+        settings=settings(
+            max_examples=1_000 if full else 40,
+            stateful_step_count=60,
+            deadline=None,
+            derandomize=not full,
+            database=None,
+            suppress_health_check=list(HealthCheck),
+        ),
+    )

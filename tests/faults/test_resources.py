@@ -1,0 +1,113 @@
+"""Processes out of descriptors, threads and shared memory: a clear error, and then it works again.
+
+The middleware is not as careful everywhere. Out of threads in the middle of creating a participant,
+Fast DDS ends the process. If shared memory runs out in the middle, what it leaves there may block
+the next participant.
+"""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+
+from tests.faults.trial import Trial
+from tests.support.program import run_program
+
+as_root = pytest.mark.skipif(
+    os.geteuid() != 0, reason="needs root, to mount a small /dev/shm or to give up its privileges"
+)
+
+SHARED = """
+import contextlib, gc, os, resource, subprocess
+from rosasync import RosasyncError
+from tests.support.checks import count_descriptors
+from tests.support.echo import ECHO
+from tests.support.serving import FORMS
+
+async def use(text="text"):
+    async with Session("short_of", bridge=bridge) as session:
+        async with session.serve(ECHO, "/own", FORMS["async, call"]):
+            await check_call(session, "/own", text, timeout=20.0)
+
+async def refused():
+    try:
+        await use()
+    except (RosasyncError, OSError) as error:
+        assert str(error)
+        return True
+    return False
+"""
+
+DESCRIPTORS = """
+async def main():
+    await use()
+    await use()
+    print("called", flush=True)
+    hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    async with Session("open", bridge=bridge) as session:
+        async with session.serve(ECHO, "/open", FORMS["async, call"]):
+            await check_call(session, "/open", "before")
+            before = count_descriptors()
+            for spare in (0, 1):
+                resource.setrlimit(resource.RLIMIT_NOFILE, (before - 1 + spare, hard))
+                assert await refused(), spare
+                for number in range(100):
+                    await check_call(session, "/open", str(number))
+                resource.setrlimit(resource.RLIMIT_NOFILE, (before + 100, hard))
+                gc.collect()
+                assert count_descriptors() == before, spare
+            await use()
+
+asyncio.run(main())
+"""
+
+THREADS = """
+async def main():
+    await use()
+    print("called", flush=True)
+    os.setgroups([])
+    os.setgid(61_234)
+    os.setuid(61_234)
+    resource.setrlimit(resource.RLIMIT_NPROC, (1, 1_000))
+    assert await refused()
+    resource.setrlimit(resource.RLIMIT_NPROC, (1_000, 1_000))
+    await use()
+
+asyncio.run(main())
+"""
+
+MEMORY = """
+async def main():
+    assert os.statvfs("/dev/shm").f_blocks * os.statvfs("/dev/shm").f_frsize < 2**21
+    # Without shared memory the middleware uses UDP, here for all of a call's packets.
+    await use("x" * 2_000_000)
+    print("called", flush=True)
+    subprocess.run(["mount", "-o", "remount,size=64m", "/dev/shm"], check=True)
+    await use("x" * 2_000_000)
+
+asyncio.run(main())
+"""
+
+
+async def test_no_descriptors(trial: Trial) -> None:
+    await _run(trial, DESCRIPTORS)
+
+
+@as_root
+async def test_no_threads(trial: Trial) -> None:
+    await _run(trial, THREADS)
+
+
+@as_root
+async def test_no_shared_memory(trial: Trial) -> None:
+    mount = 'mount -t tmpfs -o size=16k tmpfs /dev/shm && exec "$@"'
+    await _run(trial, MEMORY, "unshare", "--mount", "sh", "-c", mount, "sh")
+
+
+async def _run(trial: Trial, program: str, *prefix: str) -> None:
+    """Run a program; each counts as one answered call."""
+    trial.row.made += 1
+    code, errors = await run_program(trial.bridge, SHARED + program, prefix=prefix)
+    assert code == 0, errors[-2_000:]
+    trial.row.answered += 1

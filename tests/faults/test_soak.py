@@ -1,0 +1,131 @@
+"""Everything at once, for as long as ``--soak-minutes`` says: ``python -m pytest -m soak``."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import random
+import signal
+import time
+from collections.abc import AsyncIterator, Callable
+from contextlib import AsyncExitStack, asynccontextmanager
+from typing import Any
+
+import pytest
+
+from benchmarks.hosts import NoHosts
+from benchmarks.lossy import LossyHosts
+from tests.conftest import Bridge
+from tests.faults.caller import CallerProcess
+from tests.faults.table import Row
+from tests.support.servers import ServerProcess
+from tests.support.times import TICK
+
+NAME = "/soaked"
+PAUSE = 60 * TICK
+"""The mean time between two disturbances, in seconds."""
+
+
+class Network:
+    """Two servers and a process of callers: on hosts of their own if this machine can have them.
+
+    Without network namespaces a partition is a server that is stopped for a while.
+    """
+
+    def __init__(self, stack: AsyncExitStack) -> None:
+        self._stack = stack
+        self._hosts: LossyHosts | None = None
+        self._servers: list[ServerProcess] = []
+        self.chance = random.Random(19)
+
+    @classmethod
+    @asynccontextmanager
+    async def opened(cls) -> AsyncIterator[Network]:
+        async with AsyncExitStack() as stack:
+            network = cls(stack)
+            try:
+                network._hosts = stack.enter_context(LossyHosts("one", "two", "client", seed=19))
+            except NoHosts:
+                network._hosts = None
+            network._servers = [await network._server(host) for host in ("one", "two")]
+            yield network
+
+    async def caller(self) -> CallerProcess:
+        caller = CallerProcess(lease=5, **self._on("client"))
+        return await self._stack.enter_async_context(caller)
+
+    async def restart(self, how: Callable[[ServerProcess], None]) -> None:
+        number = self.chance.randrange(2)
+        await asyncio.to_thread(how, self._servers[number])
+        await asyncio.sleep(self.chance.uniform(0, PAUSE))
+        self._servers[number] = await self._server(["one", "two"][number])
+
+    async def partition(self) -> None:
+        await self._disturb(1.0, self.chance.uniform(0, 3 * PAUSE))
+
+    async def lose(self) -> None:
+        await self._disturb(0.1, self.chance.uniform(0, 3 * PAUSE))
+
+    async def _disturb(self, loss: float, seconds: float) -> None:
+        if self._hosts is not None:
+            self._hosts.set(loss=loss)
+            await asyncio.sleep(seconds)
+            self._hosts.set(loss=0.0)
+            return
+        pid = self.chance.choice(self._servers).pid
+        os.kill(pid, signal.SIGSTOP)
+        await asyncio.sleep(seconds)
+        os.kill(pid, signal.SIGCONT)
+
+    def _on(self, host: str) -> dict[str, Any]:
+        if self._hosts is None:
+            return {}
+        return {"prefix": self._hosts.on(host), "environment": self._hosts.environment}
+
+    async def _server(self, host: str) -> ServerProcess:
+        server = ServerProcess(lease=2, **self._on(host))
+        await self._stack.enter_async_context(server)
+        await server.serve(NAME)
+        return server
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(0)
+@pytest.mark.parametrize("full", [False], indirect=True, ids=[""])
+async def test_everything_at_once(
+    request: pytest.FixtureRequest, record: Callable[[Row], None], bridge: Bridge, full: bool
+) -> None:
+    minutes = request.config.getoption("--soak-minutes")
+    end = time.monotonic() + 60 * minutes
+    restarts = partitions = 0
+    async with Network.opened() as network:
+        caller = await network.caller()
+        await caller.start(
+            f"soak: {minutes:g} minutes",
+            bridge,
+            NAME,
+            callers=50,
+            retry=True,
+            cancel=0.1,
+            pause=10 * TICK,
+        )
+        await caller.more_answers(100)
+        while time.monotonic() < end:
+            await asyncio.sleep(network.chance.uniform(0, 2 * PAUSE))
+            match network.chance.randrange(4):
+                case 0:
+                    await network.restart(ServerProcess.kill)
+                    restarts += 1
+                case 1:
+                    await network.restart(ServerProcess.interrupt)
+                    restarts += 1
+                case 2:
+                    await network.partition()
+                    partitions += 1
+                case 3:
+                    await network.lose()
+            await caller.more_answers(50)
+        row = await caller.stop()
+    row.notes.append(f"{restarts} restarts, {partitions} partitions")
+    record(row)
+    row.check()

@@ -1,0 +1,66 @@
+"""Programs in processes of their own, which end in whatever way a test is about."""
+
+from __future__ import annotations
+
+import asyncio
+import subprocess
+import sys
+from collections.abc import Sequence
+
+from tests.support.process import ROOT
+from tests.support.times import LIMIT, TICK
+
+__all__ = ["run_program"]
+
+BEGINNING = """
+import asyncio, sys, warnings
+from rosasync import Session
+from tests.support.checks import check_call
+
+async def opened(bridge):
+    session = Session("left_open", bridge=bridge)
+    await session.__aenter__()
+    await check_call(session, "/echo", "text")
+    print("called", flush=True)
+    return session
+
+bridge = sys.argv[1]
+"""
+
+
+async def run_program(
+    bridge: str, program: str, *send: int, prefix: Sequence[str] = ()
+) -> tuple[int, str]:
+    """Run a program to its end; return its exit code and its stderr.
+
+    Args:
+        bridge: the bridge for its sessions.
+        program: the program. It prints ``called`` when it has made its first call.
+        send: signals to send it then, a tick apart.
+        prefix: the beginning of its command line.
+    """
+    process = await asyncio.create_subprocess_exec(
+        *(*prefix, sys.executable, "-W", "default::ResourceWarning"),
+        *("-c", BEGINNING + program, bridge),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        cwd=ROOT,
+    )
+    assert process.stdout is not None
+    try:
+        async with asyncio.timeout(2 * LIMIT):
+            # The middleware logs its errors there too.
+            while (line := await process.stdout.readline()) != b"called\n":
+                assert line, "it ended before its first call"
+            for number in send:
+                process.send_signal(number)
+                await asyncio.sleep(TICK)
+            _, errors = await process.communicate()
+    finally:
+        if process.returncode is None:
+            process.kill()
+            await process.wait()
+    assert process.returncode is not None
+    text = errors.decode()
+    assert "terminate called" not in text
+    return process.returncode, text
