@@ -124,7 +124,7 @@ class CallService(ServiceBehaviour[RequestT, ResponseT]):
         on_feedback: called with each new feedback message.
         timeout: seconds for the whole call; None for no deadline; if left out, the session's.
         wait: False to fail at once if there is no server.
-        qos: a ``QoSProfile``; None for the service default with a history of 1,000.
+        qos: a ``QoSProfile``; None for the service default.
         session: the session; None to take it from ``tree.setup(session=…)``.
 
     Raises:
@@ -327,7 +327,7 @@ class WaitForService(ServiceBehaviour[Any, Any]):
         srv_type: a service class or its name.
         srv_name: the service's name.
         timeout: seconds; None, or left out, for no deadline; ``...`` for the session's.
-        qos: a ``QoSProfile``; None for the service default with a history of 1,000.
+        qos: a ``QoSProfile``; None for the service default.
         session: the session; None to take it from ``tree.setup(session=…)``.
 
     Raises:

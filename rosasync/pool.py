@@ -99,7 +99,7 @@ class ClientPool:
         Args:
             srv_type: a service class or its name.
             srv_name: the service's name.
-            qos: a ``QoSProfile``; None for the service default with a history of 1,000.
+            qos: a ``QoSProfile``; None for the service default.
             timeout: seconds to wait for a client, None for no deadline; if left out, the session's.
 
         Raises:

@@ -22,6 +22,7 @@ __all__ = [
     "HEARTBEAT",
     "SWITCH",
     "applied",
+    "heartbeats",
     "is_old",
     "missing_heartbeats",
     "profile_text",
@@ -130,18 +131,36 @@ def missing_heartbeats(text: str) -> list[str]:
     return [name for name in NAMES if name not in present]
 
 
+def heartbeats() -> bool:
+    """Return whether the requests of this process have frequent heartbeats."""
+    return _State.applied or _user_heartbeats()
+
+
 @contextlib.contextmanager
-def applied() -> Iterator[None]:
-    """Let Fast DDS find the profile if it reads profiles in the block.
+def applied(*, first: bool) -> Iterator[None]:
+    """Let Fast DDS find the profile when the block makes a participant.
 
     Environment and file are gone afterwards: a child process configures itself. Does nothing if
     the user has a profile or switched this one off.
+
+    Args:
+        first: whether it is the first participant of the process. Later ones use what Fast DDS
+            has read then.
     """
     old = is_old()
-    if switched_off():
+    if switched_off() or _State.applied:
         yield
     elif file := user_profile(old):
         _report_missing(file)
+        yield
+    elif not first:
+        # Each process says it once.
+        report = logger.debug if _State.reported else logger.info
+        _State.reported = True
+        report(
+            "Fast DDS has read its profiles before this session, so a lost request is repaired "
+            "after 3 s; `rosasync profile` prints what to set in the environment",
+        )
         yield
     else:
         with TemporaryDirectory(prefix="rosasync-") as folder:
@@ -149,6 +168,22 @@ def applied() -> Iterator[None]:
             file.write_text(profile_text(old))
             with _environment(profile_variable(old), str(file)):
                 yield
+        _State.applied = True
+
+
+class _State:
+    applied = False
+    """Whether Fast DDS has read rosasync's profile in this process."""
+    reported = False
+    """Whether the log says why it has not."""
+
+
+def _user_heartbeats() -> bool:
+    file = user_profile(is_old())
+    try:
+        return file is not None and "client" not in missing_heartbeats(file.read_text())
+    except (OSError, ValueError, ElementTree.ParseError):
+        return False
 
 
 @contextlib.contextmanager

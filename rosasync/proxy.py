@@ -82,7 +82,7 @@ class AsyncServiceProxy(Generic[RequestT, ResponseT]):
         session: an open session.
         srv_type: a service class or its name, ``"std_srvs/srv/SetBool"``.
         srv_name: the service's name.
-        qos: a ``QoSProfile``; None for the service default with a history of 1,000.
+        qos: a ``QoSProfile``; None for the service default.
 
     Raises:
         TypeError, ValueError: the service type does not exist, or the QoS is not a ``QoSProfile``.

@@ -229,7 +229,8 @@ class Session:
             request: a message of the request type, a mapping of its fields, or None for an empty
                 one. It is read when it is sent: do not change it before the response.
             timeout: seconds for the whole call, None for no deadline; if left out, the session's.
-            qos: a ``QoSProfile``; None for the service default with a history of 1,000.
+            qos: a ``QoSProfile``; None for the service default with a history of 1,000, or of
+                ``Limits.in_flight``, at least 10, without rosasync's Fast DDS profile.
             wait: False to fail at once if there is no server.
             retry: when to send an unanswered request again; only for services that may run twice.
 

@@ -130,7 +130,7 @@ def lamp() -> Iterator[ServerProcess]:
 
     ``/lamp/silent`` never answers, ``/lamp/text`` echoes, ``/lamp/twice`` has two servers.
     """
-    with ServerProcess() as server:
+    with ServerProcess("lamp_server") as server:
         server.serve_now("/lamp/switch", "std_srvs/srv/SetBool")
         server.serve_now("/lamp/silent", "std_srvs/srv/SetBool", delay="never")
         server.serve_now("/lamp/text")

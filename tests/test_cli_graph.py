@@ -23,7 +23,7 @@ def test_list() -> None:
     assert not [line for line in lines if "/_" in line]
     names = [item["name"] for item in json_lines(rosasync("list", "--json").stdout)]
     assert LAMP in names
-    assert "/stock_server/get_parameters" in names
+    assert "/lamp_server/get_parameters" in names
 
 
 def test_list_hidden() -> None:
@@ -47,19 +47,19 @@ def test_info_shows_nodes_and_clashes() -> None:
     done = rosasync("info", "/lamp/twice")
     assert done.returncode == 0
     assert "servers: 2" in done.stdout
-    assert f"  /stock_server [{LAMP_TYPE}] reliable" in done.stdout
+    assert f"  /lamp_server [{LAMP_TYPE}] reliable" in done.stdout
     assert "clash: 2 servers" in done.stdout
     (server,) = json_lines(rosasync("info", LAMP, "--json").stdout)
     assert server["role"] == "server"
-    assert server["node"] == "/stock_server"
+    assert server["node"] == "/lamp_server"
     assert rosasync("info", "/lamp/none").returncode == 3
 
 
 def test_nodes() -> None:
     # Another process of the tests may have a node of the same name.
-    assert "/stock_server" in [line.split()[0] for line in rosasync("nodes").stdout.splitlines()]
+    assert "/lamp_server" in [line.split()[0] for line in rosasync("nodes").stdout.splitlines()]
     found = json_lines(rosasync("nodes", "--json").stdout)
-    assert "/stock_server" in [node["name"] for node in found]
+    assert "/lamp_server" in [node["name"] for node in found]
 
 
 @pytest.mark.parametrize(

@@ -16,8 +16,10 @@ from tests.support.process import ROOT
 
 COMMANDS = [
     *("call", "list", "type", "find", "show", "info", "nodes"),
-    *("serve", "watch", "bench", "ping", "why", "doctor", "demo"),
+    *("serve", "watch", "bench", "ping", "why", "doctor", "profile", "demo"),
 ]
+GROUPS = ["param", "lifecycle"]
+"""The commands that have commands of their own, tested in test_cli_nodes.py."""
 
 UNTIL_INTERRUPTED = {"serve", "watch", "demo --serve"}
 """The commands that run until Ctrl-C; they then say so."""
@@ -42,7 +44,7 @@ def test_help_lists_every_command_without_rclpy() -> None:
     )
     assert (done.returncode, done.stderr) == (0, "")
     listed = re.findall(r"^  (\w+)  +\S", done.stdout.partition("Commands:")[2], re.MULTILINE)
-    assert listed == COMMANDS
+    assert listed == COMMANDS + GROUPS
 
 
 def test_without_arguments_it_prints_the_help() -> None:

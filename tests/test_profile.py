@@ -152,19 +152,63 @@ def test_nothing_but_services_is_touched(old: bool) -> None:
 def test_an_unreadable_profile_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
+    monkeypatch.setattr(profile._State, "applied", False)
     file = tmp_path / "mine.xml"
     file.write_text("<profiles>")
     monkeypatch.setenv(VARIABLE, str(file))
-    with caplog.at_level("INFO", "rosasync"), profile.applied():
+    with caplog.at_level("INFO", "rosasync"), profile.applied(first=True):
         assert os.environ[VARIABLE] == str(file)
     assert f"{file} cannot be read" in caplog.text
 
 
 def test_nothing_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(profile._State, "applied", False)
     monkeypatch.delenv(VARIABLE, raising=False)
     monkeypatch.delenv(profile.SWITCH, raising=False)
-    with profile.applied():
+    with profile.applied(first=True):
         file = Path(os.environ[VARIABLE])
         assert profile.missing_heartbeats(file.read_text()) == []
     assert VARIABLE not in os.environ
     assert not file.parent.exists()
+
+
+OPEN = """
+import asyncio, logging, sys
+import rclpy, rosasync
+from rosasync import profile
+
+async def main():
+    if "late" in sys.argv:
+        rclpy.init()
+        node = rclpy.create_node("before")
+    for _ in range(2):
+        async with rosasync.Session():
+            print(profile.heartbeats())
+
+logging.basicConfig(level=logging.INFO, format="%(message)s")
+asyncio.run(main())
+"""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "environment", "known", "logged"),
+    [
+        ([], {}, "True", 0),
+        ([], {profile.SWITCH: "off"}, "False", 0),
+        (["late"], {}, "False", 1),
+    ],
+    ids=["first", "off", "late"],
+)
+def test_a_session_knows_whether_the_profile_was_read(
+    arguments: list[str], environment: dict[str, str], known: str, logged: int
+) -> None:
+    """The default depth of clients depends on it."""
+    done = subprocess.run(
+        [sys.executable, "-c", OPEN, *arguments],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, **environment},
+    )
+    assert done.stdout.split() == [known, known]
+    assert done.stderr.count("Fast DDS has read its profiles before") == logged

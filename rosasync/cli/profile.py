@@ -29,6 +29,11 @@ def profile(
 
     With it, a lost request or response is repaired within about 20 ms instead of 3 s, and a new
     process is found within about 0.2 s.
+
+    \b
+    Examples:
+      $ rosasync profile
+      $ rosasync profile --distribution kilted
     """
     old = is_old() if distribution is None else distribution is Distribution.JAZZY
     typer.echo(profile_text(old, announcement=ANNOUNCEMENT), nl=False)

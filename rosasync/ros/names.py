@@ -16,10 +16,14 @@ from rosasync.ros.failures import uses_node
 from rosasync.ros.messages import service_type, type_name
 from rosasync.statistics import ServiceKey
 
-__all__ = ["default_qos", "describe", "resolve_name"]
+__all__ = ["DEPTH", "DEPTH_WITHOUT_HEARTBEATS", "default_qos", "describe", "resolve_name"]
 
 DEPTH = 1000
-"""History of the default QoS. With rclpy's default of ten, requests and responses get lost."""
+"""History of clients and servers by default. Beside other processes' calls, the ten of rclpy's
+default get lost."""
+DEPTH_WITHOUT_HEARTBEATS = 10
+"""History of clients, at least, without the profile: where packets get lost, a deep history blocks
+behind each of them for 3 s (docs/explanation/network.md)."""
 
 
 def describe(node: Node, srv_type: Any, srv_name: str, qos: Any) -> Service:
@@ -32,9 +36,9 @@ def describe(node: Node, srv_type: Any, srv_name: str, qos: Any) -> Service:
     return Service(srv_class, srv_name, qos, key)
 
 
-def default_qos() -> QoSProfile:
-    """Return the service default with a history of 1,000."""
-    qos = QoSProfile(depth=DEPTH)
+def default_qos(depth: int = DEPTH) -> QoSProfile:
+    """Return the service default with another history."""
+    qos = QoSProfile(depth=depth)
     for name in ("history", "reliability", "durability"):
         setattr(qos, name, getattr(qos_profile_services_default, name))
     return qos

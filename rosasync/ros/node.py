@@ -76,6 +76,7 @@ class RosNode:
         self._on_graph = on_graph
         self._on_shutdown = on_shutdown
         self._introspection = options.introspection
+        self._in_flight = options.limits.in_flight
         self._graph_pending = False
         self._left = asyncio.Event()
         self._user = ThreadUser(self._post_error, self._post_shutdown, self._post_left)
@@ -134,7 +135,7 @@ class RosNode:
         """Create a client that passes its responses to ``deliver``."""
         try:
             return self._opened.open_client(
-                service.srv_type, service.srv_name, _qos_of(service), deliver
+                service.srv_type, service.srv_name, _qos_of(service, self._client_depth()), deliver
             )
         except RclpyError as error:
             raise refusal(self._node, service, "client", error) from error
@@ -143,7 +144,10 @@ class RosNode:
         """Create a service that passes its requests to ``deliver``."""
         try:
             return self._opened.open_service(
-                service.srv_type, service.srv_name, _qos_of(service), deliver
+                service.srv_type,
+                service.srv_name,
+                _qos_of(service, names.DEPTH),
+                deliver,
             )
         except RclpyError as error:
             raise refusal(self._node, service, "service", error) from error
@@ -242,15 +246,12 @@ class RosNode:
         """Make a context and its node, with rosasync's profile if the middleware reads it now."""
         self._own_context = Context()
         rclpy.init(context=self._own_context, signal_handler_options=SignalHandlerOptions.NO)
-        # The first node of a context makes its participant.
-        with profile.applied(), self._introduced(self._own_context):
+        if "fastrtps" not in rclpy.get_rmw_implementation_identifier():
             return Node(name, context=self._own_context)
-
-    def _introduced(self, context: Context) -> contextlib.AbstractContextManager[None]:
-        fast_dds = "fastrtps" in rclpy.get_rmw_implementation_identifier()
-        if not fast_dds or profile.switched_off():
-            return contextlib.nullcontext()
-        return discovery.introduced(context.get_domain_id())
+        domain = self._own_context.get_domain_id()
+        # The first node of a context makes its participant.
+        with profile.applied(first=not discovery.own_ports(domain)), _introduced(domain):
+            return Node(name, context=self._own_context)
 
     def _make_bridge(self, options: SessionOptions, librcl: rcl.Rcl | None) -> Bridge:
         tried = rclpy.get_rmw_implementation_identifier() in DIRECT_TRIED
@@ -268,6 +269,11 @@ class RosNode:
                 raise UsageError("busy_poll needs the direct bridge, which is not in use here")
             return ExecutorBridge(self._node, self._gateway, self._introspect)
         return DirectBridge(self._node, librcl, self._loop, self._introspect, options.busy_poll)
+
+    def _client_depth(self) -> int:
+        if profile.heartbeats():
+            return names.DEPTH
+        return max(names.DEPTH_WITHOUT_HEARTBEATS, self._in_flight)
 
     def _introspect(self, entity: Any) -> None:
         """Make a client or service publish its calls, as ``introspection`` says."""
@@ -312,8 +318,12 @@ class RosNode:
             self._gateway.post_if_open(self._loop.call_exception_handler, context)
 
 
-def _qos_of(service: Service) -> QoSProfile:
-    return service.qos or names.default_qos()
+def _introduced(domain: int) -> contextlib.AbstractContextManager[None]:
+    return contextlib.nullcontext() if profile.switched_off() else discovery.introduced(domain)
+
+
+def _qos_of(service: Service, depth: int) -> QoSProfile:
+    return service.qos or names.default_qos(depth)
 
 
 def _takes_callbacks(executor: Executor | None) -> bool:

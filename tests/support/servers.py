@@ -59,9 +59,17 @@ def running(program: Path) -> Iterator[None]:
 
 
 class ServerProcess(Child):
-    """The parent's side of one such process."""
+    """The parent's side of one such process.
+
+    Args:
+        node: the name of its node. Two that live at the same time need different ones.
+        options: those of `Child`.
+    """
 
     module = "tests.support.servers"
+
+    def __init__(self, node: str = "stock_server", **options: Any) -> None:
+        super().__init__(node, **options)
 
     async def serve(self, name: str, srv_type: str = ECHO, **options: Any) -> None:
         """Create a service without blocking the loop; the options are those of `serve_now`."""
@@ -321,7 +329,7 @@ def main() -> None:
     from rclpy.signals import SignalHandlerOptions
 
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    node = rclpy.create_node("stock_server")
+    node = rclpy.create_node(sys.argv[1])
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     servers = _Servers(node, executor)
