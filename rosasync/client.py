@@ -234,7 +234,6 @@ class Client:
 
     def learn_servers(self, servers: Servers) -> None:
         """Set the servers of later requests, and of those whose servers are not known yet."""
-        self.free_predecessors(servers)
         self.servers = servers
         for call in self.unanswered.values():
             if call.servers is None:

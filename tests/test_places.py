@@ -142,21 +142,25 @@ async def test_only_one_place_in_each_time_without_answers(
     assert not [wait for wait in waits if 0 < wait < patience]
 
 
-@pytest.mark.usefixtures("patience")
-async def test_an_answer_begins_the_time_again(fake_graph: FakeGraph) -> None:
+@pytest.mark.parametrize("answered", [False, True])
+@pytest.mark.parametrize("patience", [100 * LIMIT], indirect=True)
+async def test_an_answer_begins_the_time_again(
+    fake_graph: FakeGraph, patience: float, answered: bool
+) -> None:
     fake_graph.serve(Echo, "/echo", echo)
-    async with fake_graph.session(limits=Limits(in_flight=2, grace=LONG)) as session:
+    async with fake_graph.session(limits=Limits(in_flight=2, grace=LONG * LIMIT)) as session:
         await ask(session, 0)
+        (client,) = session.pool.service(Echo, "/echo", None).clients
         port = the_port(fake_graph)
         with fake_graph.drop_requests():
             await abandon(session, 2)
-            waiting = session.start(Echo, "/echo", Echo.Request(1), timeout=None)
-            for _ in range(20):
-                # An answer to none of them: the server is alive, and may still answer them.
-                port.deliver(1, Echo.Response())
-                await asyncio.sleep(TICK / 10)
-            silent = len(port.sent)
-        await asyncio.wait_for(until(lambda: len(port.sent) > silent or silent > 3), LIMIT)
+        client._silent_since -= 2 * patience
+        if answered:
+            # To none of them: the server is alive, and may still answer them.
+            port.deliver(1, Echo.Response())
+        waiting = session.start(Echo, "/echo", Echo.Request(1), timeout=None)
+        await asyncio.sleep(TICK)
+        assert len(port.sent) == (3 if answered else 4)
         waiting.cancel()
         await asyncio.wait([waiting])
 

@@ -348,6 +348,7 @@ async def test_the_jitter_differs(fake_graph: FakeGraph, delays: list[float]) ->
     assert all(0.5 <= delay <= 0.625 for delay in delays)
 
 
+@pytest.mark.usefixtures("patient")
 class TestNextServer:
     """A retried call whose server vanishes goes to the next one."""
 
@@ -398,6 +399,20 @@ class TestNextServer:
             server = fake_graph.serve(Echo, "/echo", echo)
             assert (await asyncio.wait_for(task, LIMIT)).value == 1
             assert received(server) == [1]
+
+    async def test_whatever_the_budget(self, fake_graph: FakeGraph) -> None:
+        server = fake_graph.serve(Echo, "/echo", echo)
+        async with fake_graph.session() as session:
+            await ask(session, 0)
+            with fake_graph.drop_requests():
+                task = start(session, 1, retry=Retry(2, NEVER, budget=0.0), timeout=None)
+                for restart in range(1, 31):
+                    server.close()
+                    server = fake_graph.serve(Echo, "/echo", echo)
+                    await until(lambda n=restart: session.pool.statistics().retried == n)  # type: ignore[misc]
+            server.close()
+            fake_graph.serve(Echo, "/echo", echo)
+            assert (await asyncio.wait_for(task, LIMIT)).value == 1
 
     async def test_not_if_it_may_be_sent_only_once(self, fake_graph: FakeGraph) -> None:
         server = fake_graph.serve(Echo, "/echo", echo)
