@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from rosasync.cli.profile import profile
 from rosasync.demo.run import DemoError, run_demo
 
 __all__ = ["app"]
@@ -28,6 +29,9 @@ def _print_version(wanted: bool) -> None:
     except PackageNotFoundError:
         typer.echo("rosasync, not installed: run from a source tree")
     raise typer.Exit
+
+
+app.command()(profile)
 
 
 @app.callback()

@@ -17,11 +17,12 @@ from rclpy.qos import QoSProfile, qos_profile_system_default
 from rclpy.service_introspection import ServiceIntrospectionState
 from rclpy.signals import SignalHandlerOptions
 
+from rosasync import profile
 from rosasync.errors import RosasyncError, UsageError
 from rosasync.gateway import LoopGateway
 from rosasync.options import SessionOptions
 from rosasync.ports import ClientPort, Deliver, DeliverRequest, Service, ServicePort
-from rosasync.ros import names, rcl
+from rosasync.ros import discovery, names, rcl
 from rosasync.ros.direct_bridge import DirectBridge
 from rosasync.ros.executor_bridge import ExecutorBridge
 from rosasync.ros.executor_thread import ExecutorThread, ThreadUser, executor_thread_of
@@ -228,9 +229,7 @@ class RosNode:
         if context is not None and not context.ok():
             raise UsageError("the context is not initialised, or was shut down: rclpy.init() it")
         try:
-            self._own_node = Node(
-                node, context=self._make_context() if context is None else context
-            )
+            self._own_node = Node(node, context=context) if context else self._make_own(node)
         except InvalidNodeNameException as error:
             reason = str(error).strip().replace("\n", " ")
             raise ValueError(f"{node!r} is not a valid node name: {reason}") from None
@@ -239,10 +238,19 @@ class RosNode:
             raise RosasyncError(f"rclpy cannot create the node {node!r}: {error}") from error
         return self._own_node
 
-    def _make_context(self) -> Context:
+    def _make_own(self, name: str) -> Node:
+        """Make a context and its node, with rosasync's profile if the middleware reads it now."""
         self._own_context = Context()
         rclpy.init(context=self._own_context, signal_handler_options=SignalHandlerOptions.NO)
-        return self._own_context
+        # The first node of a context makes its participant.
+        with profile.applied(), self._introduced(self._own_context):
+            return Node(name, context=self._own_context)
+
+    def _introduced(self, context: Context) -> contextlib.AbstractContextManager[None]:
+        fast_dds = "fastrtps" in rclpy.get_rmw_implementation_identifier()
+        if not fast_dds or profile.switched_off():
+            return contextlib.nullcontext()
+        return discovery.introduced(context.get_domain_id())
 
     def _make_bridge(self, options: SessionOptions, librcl: rcl.Rcl | None) -> Bridge:
         tried = rclpy.get_rmw_implementation_identifier() in DIRECT_TRIED

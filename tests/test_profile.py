@@ -1,0 +1,170 @@
+"""The Fast DDS profile: its text, the command, and which processes send heartbeats by it."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+from benchmarks.hosts import NoHosts
+from benchmarks.lossy import LossyHosts
+from rosasync import profile
+from tests.support.times import LIMIT, TICK, until
+
+ROOT = Path(__file__).parents[1]
+MANY = 30
+"""More packets than a second without a profile has, and fewer than one with a profile has."""
+SECOND = 20 * TICK
+VARIABLE = profile.profile_variable(profile.is_old())
+ONLY_CLIENT = profile.profile_text(profile.is_old(), names=("client",))
+OTHERS = ONLY_CLIENT.replace('"client"', '"/chatter"')
+
+
+@pytest.fixture(scope="module")
+def hosts() -> Iterator[LossyHosts]:
+    with ExitStack() as stack:
+        try:
+            entered = stack.enter_context(LossyHosts("server", "client"))
+        except NoHosts as exc:
+            pytest.skip(str(exc))
+        yield entered
+
+
+@contextmanager
+def program(
+    hosts: LossyHosts, host: str, kind: str, folder: Path, environment: Mapping[str, str]
+) -> Iterator[subprocess.Popen[str]]:
+    with subprocess.Popen(
+        [*hosts.on(host), sys.executable, "-m", "tests.support.unanswered", kind],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(ROOT), **hosts.environment, **environment},
+    ) as process:
+        try:
+            assert process.stdout is not None
+            # Fast DDS writes what it finds wrong in a profile to standard output.
+            assert process.stdout.readline() == "ready\n"
+            yield process
+        finally:
+            process.kill()
+
+
+async def run_client(
+    hosts: LossyHosts, kind: str, folder: Path, environment: Mapping[str, str], *, often: bool
+) -> str:
+    """Check how often a client sends heartbeats for an unanswered request; return its log."""
+    off = {profile.SWITCH: "off"}
+    with (
+        program(hosts, "server", "server", ROOT, off) as server,
+        program(hosts, "client", kind, folder, environment) as client,
+    ):
+        server.send_signal(signal.SIGSTOP)
+        await asyncio.sleep(SECOND)
+        before = hosts.counts()["frames"]
+        assert client.stdin is not None
+        client.stdin.write("send\n")
+        client.stdin.flush()
+        if often:
+            await until(lambda: hosts.counts()["frames"] - before >= MANY)
+        else:
+            await asyncio.sleep(SECOND)
+            assert hosts.counts()["frames"] - before < MANY
+        server.send_signal(signal.SIGCONT)
+        return client.communicate("end\n", timeout=LIMIT)[1]
+
+
+class TestSession:
+    async def test_a_session_uses_it(self, hosts: LossyHosts, tmp_path: Path) -> None:
+        log = await run_client(hosts, "session", tmp_path, {}, often=True)
+        assert "profile" not in log
+
+    async def test_switched_off(self, hosts: LossyHosts, tmp_path: Path) -> None:
+        off = {profile.SWITCH: "off"}
+        log = await run_client(hosts, "session", tmp_path, off, often=False)
+        assert "profile" not in log
+
+    @pytest.mark.parametrize(
+        ("text", "missing"),
+        [(OTHERS, "'client' and 'service'"), (ONLY_CLIENT, "'service'")],
+        ids=["neither", "one"],
+    )
+    async def test_the_users_own_wins(
+        self, hosts: LossyHosts, tmp_path: Path, text: str, missing: str
+    ) -> None:
+        file = tmp_path / "mine.xml"
+        file.write_text(text)
+        given, often = {VARIABLE: str(file)}, text == ONLY_CLIENT
+        log = await run_client(hosts, "session", tmp_path, given, often=often)
+        assert f"sets no heartbeat period for the publishers {missing}, so" in log
+
+    async def test_the_users_file_in_the_working_directory(
+        self, hosts: LossyHosts, tmp_path: Path
+    ) -> None:
+        name = profile.OLD_FILE if profile.is_old() else profile.NEW_FILE
+        (tmp_path / name).write_text(OTHERS)
+        log = await run_client(hosts, "session", tmp_path, {}, often=False)
+        assert name in log
+
+
+class TestCommand:
+    async def test_a_stock_node_uses_it(self, hosts: LossyHosts, tmp_path: Path) -> None:
+        file = tmp_path / "profile.xml"
+        file.write_text(print_profile().stdout)
+        given = {VARIABLE: str(file)}
+        await run_client(hosts, "stock", tmp_path, given, often=True)
+
+    def test_it_says_how_to_use_it_on_stderr(self) -> None:
+        assert f"export {VARIABLE}=" in print_profile().stderr
+        for name, variable in (("jazzy", "FASTRTPS"), ("kilted", "FASTDDS")):
+            done = print_profile("--distribution", name)
+            assert f"export {variable}_DEFAULT_PROFILES_FILE=" in done.stderr
+            assert profile.missing_heartbeats(done.stdout) == []
+
+    def test_it_does_not_import_rclpy(self) -> None:
+        code = "import sys; sys.modules['rclpy'] = None; sys.argv[1:] = ['profile']; "
+        code += "from rosasync.__main__ import main; main()"
+        assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def print_profile(*options: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "rosasync", "profile", *options]
+    return subprocess.run(command, capture_output=True, text=True, check=True)
+
+
+@pytest.mark.parametrize("old", [True, False])
+def test_nothing_but_services_is_touched(old: bool) -> None:
+    root = ElementTree.fromstring(profile.profile_text(old))
+    names = [(element.tag.rpartition("}")[2], element.get("profile_name")) for element in root]
+    assert names == [("publisher", "client"), ("publisher", "service")]
+
+
+def test_an_unreadable_profile_is_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    file = tmp_path / "mine.xml"
+    file.write_text("<profiles>")
+    monkeypatch.setenv(VARIABLE, str(file))
+    with caplog.at_level("INFO", "rosasync"), profile.applied():
+        assert os.environ[VARIABLE] == str(file)
+    assert f"{file} cannot be read" in caplog.text
+
+
+def test_nothing_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(VARIABLE, raising=False)
+    monkeypatch.delenv(profile.SWITCH, raising=False)
+    with profile.applied():
+        file = Path(os.environ[VARIABLE])
+        assert profile.missing_heartbeats(file.read_text()) == []
+    assert VARIABLE not in os.environ
+    assert not file.parent.exists()
