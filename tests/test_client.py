@@ -161,7 +161,11 @@ async def test_a_request_that_leaves_twice_is_forgotten_once() -> None:
         for _ in range(2):
             under_test.client.leave(1)
         forgotten: list[int] = []
-        under_test.port.forget = forgotten.append  # type: ignore[method-assign]
+
+        def forget(sequence_number: int) -> None:
+            forgotten.append(sequence_number)
+
+        under_test.port.forget = forget  # type: ignore[method-assign]
         await until(lambda: forgotten)
         await asyncio.sleep(TICK)
     assert (forgotten, reported) == ([1], [])

@@ -23,9 +23,7 @@ SHAPES = {
 }
 
 
-async def test_clients_leases_and_servers(
-    trial: Trial, server: ServerProcess, full: bool
-) -> None:
+async def test_clients_leases_and_servers(trial: Trial, server: ServerProcess, full: bool) -> None:
     await server.serve("/echo")
     limits = Limits(clients=4, in_flight=2, idle=TICK, grace=2 * TICK)
     chance = random.Random(11)
