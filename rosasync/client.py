@@ -306,6 +306,9 @@ class Client:
         """Expect a late response for the grace period, without a place for it."""
         if self.closed or self._loop.is_closed():
             return
+        # A retried call leaves an attempt whose place was given up before.
+        if earlier := self._superseded.get(sequence_number):
+            earlier.cancel()
         timer = self._loop.call_later(self._grace, self._forget, sequence_number)
         self._superseded[sequence_number] = timer
 

@@ -15,6 +15,7 @@ from rosasync.client import Client, Counts
 from rosasync.retry import Attempts, RetryBudget
 from rosasync.statistics import ServiceKey
 from rosasync.testing import FakeClient, FakeGraph, FakeNode
+from tests.support.nodes import reports
 from tests.support.times import TICK, until
 
 
@@ -152,3 +153,19 @@ async def test_close_is_idempotent_and_leaves_no_timer() -> None:
     assert timer.cancelled()
     assert tested.port.closed
     assert repr(tested.client) == "<Client closed, 0 leases, 0 abandoned>"
+
+
+async def test_a_request_that_leaves_twice_is_forgotten_once() -> None:
+    under_test = ClientUnderTest(grace=TICK)
+    with reports() as reported:
+        for _ in range(2):
+            under_test.client.leave(1)
+        forgotten: list[int] = []
+
+        def forget(sequence_number: int) -> None:
+            forgotten.append(sequence_number)
+
+        under_test.port.forget = forget  # type: ignore[method-assign]
+        await until(lambda: forgotten)
+        await asyncio.sleep(TICK)
+    assert (forgotten, reported) == ([1], [])

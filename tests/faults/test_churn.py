@@ -23,9 +23,7 @@ SHAPES = {
 }
 
 
-async def test_of_clients_leases_and_servers(
-    trial: Trial, server: ServerProcess, full: bool
-) -> None:
+async def test_clients_leases_and_servers(trial: Trial, server: ServerProcess, full: bool) -> None:
     await server.serve("/echo")
     limits = Limits(clients=4, in_flight=2, idle=TICK, grace=2 * TICK)
     chance = random.Random(11)
@@ -94,7 +92,7 @@ if sys.version_info >= (3, 12):
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.asyncio(loop_factories=["asyncio", "uvloop"])
-async def test_of_cancelled_calls(
+async def test_cancelled_calls(
     trial: Trial, server: ServerProcess, full: bool, shape: str, mode: str
 ) -> None:
     async with MODES[mode](), trial.session(limits=SHAPES[shape]) as session:
@@ -103,7 +101,7 @@ async def test_of_cancelled_calls(
 
 @pytest.mark.parametrize("bridge", ["direct"])
 @pytest.mark.parametrize("shape", SHAPES)
-async def test_of_cancelled_calls_with_busy_poll(
+async def test_cancelled_calls_with_busy_poll(
     trial: Trial, server: ServerProcess, full: bool, shape: str
 ) -> None:
     async with trial.session(limits=SHAPES[shape], busy_poll=0.0005) as session:

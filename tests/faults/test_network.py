@@ -68,7 +68,7 @@ LINKS = {
 
 
 @pytest.mark.parametrize(("full", "link"), forms("2 % lost", *LINKS), indirect=["full"])
-async def test_of(
+async def test_link(
     request: pytest.FixtureRequest,
     hosts: LossyHosts,
     remote: ServerProcess,
@@ -95,7 +95,7 @@ async def test_of(
 
 
 @pytest.mark.parametrize(("full", "link"), forms("2 % lost", *LINKS), indirect=["full"])
-async def test_of_with_the_stock_client(
+async def test_link_with_the_stock_client(
     request: pytest.FixtureRequest,
     hosts: LossyHosts,
     remote: ServerProcess,
