@@ -71,7 +71,7 @@ class CallerProcess(Child):
         enough = await self.answered() + count
         deadline = time.monotonic() + 3 * LIMIT
         while await self.answered() < enough:
-            assert time.monotonic() < deadline, "no call is answered"
+            assert time.monotonic() < deadline, f"less than {count} calls were answered"
             await asyncio.sleep(TICK)
 
     async def stop(self) -> Row:

@@ -149,6 +149,8 @@ class Trial:
             kind: max(0, after[kind] - self._before[kind]) for kind in after if kind != "MB"
         }
         row.leaked["places"] = self._places
+        if row.leaked["threads"]:
+            row.notes.append("threads: " + ", ".join(sorted(_thread_names())))
         if (grown := after["MB"] - self._before["MB"]) > self.growth:
             row.leaked["MB"] = round(grown)
         return row
@@ -191,6 +193,12 @@ def _measure() -> dict[str, float]:
         "shared memory": _shared_memory(),
         "MB": resident_megabytes(),
     }
+
+
+def _thread_names() -> list[str]:
+    """Return the names of this process's threads, as the middleware and Python gave them."""
+    python = [thread.name for thread in threading.enumerate()]
+    return [*python, *(path.read_text().strip() for path in Path("/proc/self/task").glob("*/comm"))]
 
 
 def _shared_memory() -> int:
