@@ -20,6 +20,9 @@ from tests.support.clients import ClientProcess
 from tests.support.servers import ServerProcess
 from tests.support.times import LIMIT
 
+# pytest loads it by itself if rosasync is installed; a checkout on PYTHONPATH may be not.
+pytest_plugins = ["pytest_rosasync"]
+
 isolate()
 
 # A shell that starts this in the background ignores SIGINT, and child processes inherit that.
