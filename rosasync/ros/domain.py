@@ -8,7 +8,7 @@ import random
 import tempfile
 from pathlib import Path
 
-__all__ = ["isolate"]
+__all__ = ["isolate", "isolate_once"]
 
 _claimed: list[int] = []
 
@@ -40,3 +40,12 @@ def isolate() -> int:
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
         return domain
     raise RuntimeError("all ROS domains from 1 to 101 are claimed by running processes")
+
+
+def isolate_once() -> int:
+    """Return the domain that `isolate` has put this process into; call it if it never did.
+
+    Raises:
+        RuntimeError: every domain is taken.
+    """
+    return int(os.environ["ROS_DOMAIN_ID"]) if _claimed else isolate()

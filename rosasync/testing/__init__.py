@@ -1,13 +1,29 @@
-"""Tests without a middleware: a ROS graph in memory, and a pytest plugin with fixtures for it.
+"""Tests of nodes that call or serve: a graph in memory or on real ROS, faults, time, recordings.
 
-``pytest_plugins = ["rosasync.testing"]`` in a ``conftest.py`` loads the fixtures ``fake_graph`` and
-``ros_domain``.
+pytest loads the fixtures ``ros_graph``, ``virtual_clock``, ``ros_domain`` and ``fake_graph`` by
+itself. With another test runner, use `Graph` and `VirtualClock`.
 """
 
 from __future__ import annotations
 
+from rosasync.testing.clock import VirtualClock
 from rosasync.testing.graph import FakeClient, FakeGraph, FakeNode, FakeServer, FakeService
+from rosasync.testing.recording import RecordedCall, Recording
+from rosasync.testing.ros_graph import Graph
+from rosasync.testing.stub import StubCall, StubServer
 
-__all__ = ["FakeClient", "FakeGraph", "FakeNode", "FakeServer", "FakeService"]
+__all__ = [
+    "FakeClient",
+    "FakeGraph",
+    "FakeNode",
+    "FakeServer",
+    "FakeService",
+    "Graph",
+    "RecordedCall",
+    "Recording",
+    "StubCall",
+    "StubServer",
+    "VirtualClock",
+]
 
 pytest_plugins = ["rosasync.testing.plugin"]

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+import logging
 from collections import deque
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -35,6 +36,8 @@ __all__ = [
     "FakeServer",
     "FakeService",
 ]
+
+logger = logging.getLogger("rosasync")
 
 
 @dataclass(eq=False)
@@ -74,11 +77,18 @@ class FakeServer:
             self.handle_queued()
 
     def handle_queued(self) -> None:
-        """Handle the queued requests and send their responses."""
+        """Handle the queued requests and send their responses.
+
+        If a handler raises, its request stays unanswered.
+        """
         while self._queue:
             client, number, request = self._queue.popleft()
             self.received.append(request)
-            response = self.handler(request)
+            try:
+                response = self.handler(request)
+            except Exception:
+                logger.exception("%s: the handler of request #%d failed", self.srv_name, number)
+                continue
             if not self.graph.dropping_responses:
                 client.later(self.graph.delay, number, response)
 
@@ -178,7 +188,10 @@ class FakeGraph:
     def serve(
         self, srv_type: Any, srv_name: str, handler: Callable[[Any], Any], *, depth: int = 10
     ) -> FakeServer:
-        """Add a server to the graph; ``handler(request)`` returns the response."""
+        """Add a server to the graph; ``handler(request)`` returns the response, at once.
+
+        For the kinds of handlers that `rosasync.Session.serve` takes, see `Graph.serve`.
+        """
         server = FakeServer(self, service_type(srv_type), srv_name, handler, depth)
         self.servers.append(server)
         self.changed()

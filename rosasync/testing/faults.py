@@ -1,0 +1,178 @@
+"""Faults of one server: its service port, with responses that are late, lost, held or doubled."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from copy import deepcopy
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from rosasync.ports import PortDestroyed, Undeliverable, Unmatched
+
+if TYPE_CHECKING:
+    from rosasync.ports import DeliverRequest, RequestHeader, Service, ServicePort
+    from rosasync.testing.hooks import OpenService
+
+__all__ = ["Faults", "FaultyService", "StubCall"]
+
+REMATCH = 0.05
+"""Seconds after which a response is sent again to a client that is not fully discovered."""
+
+
+@dataclass(eq=False)
+class StubCall:
+    """A request that a `StubServer` received.
+
+    Attributes:
+        request: the request message.
+        response: a copy of the response; None if there is none yet. It is set when the handler
+            responds, even if a fault then delays or drops it.
+    """
+
+    request: Any
+    response: Any = None
+
+
+@dataclass
+class Faults:
+    """What goes wrong between one server and its clients.
+
+    Attributes:
+        delay: seconds by which responses are delayed.
+        dropping_requests: whether requests are lost.
+        dropping_responses: whether responses are lost.
+        duplicating: whether responses are sent twice.
+        holding: whether responses are held back.
+        held: sends the responses that were held back.
+    """
+
+    delay: float = 0.0
+    dropping_requests: bool = False
+    dropping_responses: bool = False
+    duplicating: bool = False
+    holding: bool = False
+    held: list[Callable[[], None]] = field(default_factory=list)
+
+    @contextmanager
+    def set(self, name: str, value: object) -> Iterator[None]:
+        """Set one of the attributes in this block."""
+        before = getattr(self, name)
+        setattr(self, name, value)
+        try:
+            yield
+        finally:
+            setattr(self, name, before)
+
+    def release(self) -> None:
+        """Send the responses that were held back."""
+        held, self.held = self.held, []
+        for send in held:
+            send()
+
+
+class FaultyService:
+    """A service port with faults: a `rosasync.ports.ServicePort`.
+
+    Args:
+        open_service: opens the port that this one wraps.
+        service: the service.
+        deliver: takes the requests.
+        faults: what goes wrong.
+        on_call: called with each request that arrives.
+    """
+
+    def __init__(
+        self,
+        open_service: OpenService,
+        service: Service,
+        deliver: DeliverRequest,
+        faults: Faults,
+        on_call: Callable[[StubCall], None],
+    ) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._deliver = deliver
+        self._faults = faults
+        self._on_call = on_call
+        # By the identity of the header, which is kept so that no other one takes its place.
+        self._calls: dict[int, tuple[RequestHeader, StubCall]] = {}
+        self._closed = False
+        self._port = open_service(service, self._arrived)
+
+    @property
+    def handle(self) -> Any:
+        """The ``rclpy.service.Service``."""
+        return self._port.handle
+
+    @property
+    def qos(self) -> Any:
+        """The ``QoSProfile`` in use."""
+        return self._port.qos
+
+    @property
+    def destroy_delay(self) -> float:
+        """Seconds to wait between `stop` and `close`."""
+        return self._port.destroy_delay
+
+    @property
+    def destroyed(self) -> bool:
+        """Whether something other than rosasync has destroyed the service."""
+        return self._port.destroyed
+
+    def send(self, header: RequestHeader, response: Any) -> None:
+        """Send a response as the faults say. From any thread."""
+        faults = self._faults
+        copy = deepcopy(response)
+        if (entry := self._calls.pop(id(header), None)) is not None:
+            entry[1].response = copy
+        if faults.dropping_responses:
+            return
+        if faults.holding:
+            faults.held.append(lambda: self._send_later(header, copy))
+        elif faults.delay:
+            self._loop.call_soon_threadsafe(
+                self._loop.call_later, faults.delay, self._send_later, header, copy
+            )
+        else:
+            self._port.send(header, response)
+        if faults.duplicating:
+            self._loop.call_soon_threadsafe(self._send_later, header, copy)
+
+    def has_clients(self) -> bool:
+        """Return whether the graph shows a client."""
+        return self._port.has_clients()
+
+    def stop(self) -> None:
+        """Stop delivering requests; idempotent."""
+        self._port.stop()
+
+    def close(self) -> None:
+        """Destroy the service; idempotent. Delayed and held responses are lost."""
+        self._closed = True
+        self._port.close()
+
+    def _arrived(self, request: Any, header: RequestHeader) -> None:
+        if self._faults.dropping_requests:
+            return
+        call = StubCall(deepcopy(request))
+        self._calls[id(header)] = header, call
+        self._on_call(call)
+        self._deliver(request, header)
+
+    def _send_later(self, header: RequestHeader, response: Any) -> None:
+        if self._closed:
+            return
+        try:
+            self._port.send(header, response)
+        except Unmatched:
+            self._loop.call_later(REMATCH, self._send_later, header, response)
+        except (Undeliverable, PortDestroyed):
+            # The server has counted the response as sent: it is lost on its way.
+            return
+
+
+if TYPE_CHECKING:
+
+    def _fits(service: FaultyService) -> ServicePort:
+        return service

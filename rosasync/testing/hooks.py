@@ -1,0 +1,118 @@
+"""Sessions of a `Graph`: their nodes, in memory and on real ROS, report to the graph."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from rosasync.session import Session
+from rosasync.testing.graph import FakeGraph, FakeNode
+
+if TYPE_CHECKING:
+    from rosasync.gateway import LoopGateway
+    from rosasync.ports import (
+        ClientPort,
+        Deliver,
+        DeliverRequest,
+        NodePort,
+        Service,
+        ServicePort,
+    )
+
+__all__ = ["GraphSession", "HookedFakeNode", "Hooks", "OpenClient", "OpenService"]
+
+OpenClient: TypeAlias = "Callable[[Service, Deliver], ClientPort]"
+"""Opens a client's port."""
+OpenService: TypeAlias = "Callable[[Service, DeliverRequest], ServicePort]"
+"""Opens a service's port."""
+
+
+@dataclass
+class Hooks:
+    """What a node calls for its clients and services.
+
+    Attributes:
+        wrap_client: opens a client with the function it is given, and returns what to use instead.
+        wrap_service: the same for a service.
+        on_missing: called with a service that was called and has no server.
+    """
+
+    wrap_client: Callable[[OpenClient, Service, Deliver], ClientPort] | None = None
+    wrap_service: Callable[[OpenService, Service, DeliverRequest], ServicePort] | None = None
+    on_missing: Callable[[Service], None] | None = None
+
+    def open_client(self, opener: OpenClient, service: Service, deliver: Deliver) -> ClientPort:
+        """Open a client."""
+        if self.wrap_client is None:
+            return opener(service, deliver)
+        return self.wrap_client(opener, service, deliver)
+
+    def open_service(
+        self, opener: OpenService, service: Service, deliver: DeliverRequest
+    ) -> ServicePort:
+        """Open a service."""
+        if self.wrap_service is None:
+            return opener(service, deliver)
+        return self.wrap_service(opener, service, deliver)
+
+    def report_missing(self, service: Service) -> None:
+        """Report a service that was called and has no server."""
+        if self.on_missing is not None:
+            self.on_missing(service)
+
+
+class GraphSession(Session):
+    """A session whose node has hooks.
+
+    Args:
+        hooks: what its node calls.
+        fake: the graph in memory; None for real ROS.
+        node: the node's name, or on real ROS an rclpy node.
+        options: those of `rosasync.Session`.
+    """
+
+    def __init__(self, hooks: Hooks, fake: FakeGraph | None, node: Any, **options: Any) -> None:
+        super().__init__(node, **options)
+        self._hooks = hooks
+        self._fake = fake
+
+    def _open_node(
+        self, gateway: LoopGateway, on_graph: Callable[[], None], on_shutdown: Callable[[], None]
+    ) -> NodePort:
+        if self._fake is not None:
+            return HookedFakeNode(self._fake, self._hooks, on_graph, on_shutdown)
+        # Only now, because a graph in memory needs no rclpy.
+        module = importlib.import_module("rosasync.testing.ros_node")
+        node: NodePort = module.HookedRosNode(
+            self._options, gateway, on_graph, on_shutdown, self._hooks
+        )
+        return node
+
+
+class HookedFakeNode(FakeNode):
+    """A node in memory, with hooks."""
+
+    def __init__(
+        self,
+        graph: FakeGraph,
+        hooks: Hooks,
+        on_graph: Callable[[], None],
+        on_shutdown: Callable[[], None],
+    ) -> None:
+        super().__init__(graph, on_graph, on_shutdown)
+        self._hooks = hooks
+
+    def open_client(self, service: Service, deliver: Deliver) -> Any:
+        """Create a client that passes its responses to ``deliver``."""
+        return self._hooks.open_client(super().open_client, service, deliver)
+
+    def open_service(self, service: Service, deliver: DeliverRequest) -> Any:
+        """Create a service that passes its requests to ``deliver``."""
+        return self._hooks.open_service(super().open_service, service, deliver)
+
+    def explain_missing(self, service: Service) -> str:
+        """List the services in the graph, and report that this one is missing."""
+        self._hooks.report_missing(service)
+        return super().explain_missing(service)

@@ -1,0 +1,242 @@
+"""Recording: the calls of a session, or of other nodes, saved as YAML and replayed by a stub."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import AsyncIterator, Iterable
+from contextlib import asynccontextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+from rosasync.ros.messages import service_type, to_dict, to_message, type_name
+from rosasync.testing.hooks import GraphSession, Hooks
+
+if TYPE_CHECKING:
+    from rosasync.ports import ClientPort, Deliver, Service
+    from rosasync.session import Session
+    from rosasync.testing.hooks import OpenClient
+
+__all__ = ["RecordedCall", "Recording"]
+
+logger = logging.getLogger("rosasync")
+
+FORMAT = 1
+"""The version of the files."""
+HISTORY = 1000
+"""How many introspection events may wait to be recorded."""
+REQUESTS = (0, 1)
+"""The ``event_type`` of events that carry requests: sent, received."""
+
+
+@dataclass
+class RecordedCall:
+    """A call and its response, as plain values.
+
+    Attributes:
+        service: the resolved name of the service.
+        type: the name of its type.
+        request: the fields of the request.
+        response: the fields of the response; None if it was not answered.
+    """
+
+    service: str
+    type: str
+    request: dict[str, Any]
+    response: dict[str, Any] | None = None
+
+
+class Recording:
+    """Calls and their responses, in the order of the calls.
+
+    Record the calls of a session with `session`, or those of other nodes with `listen`. Replay them
+    with `Graph.replay`.
+
+    Attributes:
+        calls: the recorded calls.
+    """
+
+    def __init__(self, calls: Iterable[RecordedCall] = ()) -> None:
+        self.calls: list[RecordedCall] = list(calls)
+
+    def __repr__(self) -> str:
+        return f"<Recording {len(self.calls)} calls>"
+
+    # Recording.
+
+    def session(self, node: Any = "rosasync", **options: Any) -> Session:
+        """Create a session on real ROS that records its calls.
+
+        For a session in memory, see `Graph.session`.
+
+        Args:
+            node: as for `rosasync.Session`.
+            options: those of `rosasync.Session`.
+        """
+        return GraphSession(Hooks(wrap_client=self.wrap_client), None, node, **options)
+
+    @asynccontextmanager
+    async def listen(
+        self, session: Session, *services: tuple[type[Any] | str, str]
+    ) -> AsyncIterator[Self]:
+        """Record the calls of other nodes in this block, by their introspection events.
+
+        Clients or servers of these services must publish the contents of their calls: those of a
+        ``Session(introspection="contents")``, or those for which ``configure_introspection`` was
+        called. Calls before the events are discovered are missing.
+
+        Args:
+            session: an open session on real ROS.
+            services: the type and the name of each service.
+        """
+        loop = asyncio.get_running_loop()
+        node = session.node
+        subscriptions = []
+        for srv_type, srv_name in services:
+            kind = service_type(srv_type)
+            listener = _Listener(self, type_name(kind), node.resolve_service_name(srv_name))
+
+            def post(event: Any, listener: _Listener = listener) -> None:
+                loop.call_soon_threadsafe(listener.take, event)
+
+            topic = f"{listener.srv_name}/_service_event"
+            subscriptions.append(node.create_subscription(kind.Event, topic, post, HISTORY))
+        try:
+            yield self
+        finally:
+            for subscription in subscriptions:
+                node.destroy_subscription(subscription)
+
+    def wrap_client(self, opener: OpenClient, service: Service, deliver: Deliver) -> ClientPort:
+        """Open a client that records its calls."""
+        return _RecordingClient(opener, service, deliver, self)
+
+    # Files.
+
+    def save(self, path: str | Path) -> None:
+        """Write the calls to a YAML file.
+
+        Raises:
+            ImportError: PyYAML is not installed.
+            OSError: the file cannot be written.
+        """
+        import yaml
+
+        content = {"rosasync-recording": FORMAT, "calls": [asdict(call) for call in self.calls]}
+        Path(path).write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read a file that `save` has written, or that was written by hand.
+
+        Raises:
+            ImportError: PyYAML is not installed.
+            OSError: the file cannot be read.
+            ValueError: it is not a recording, or a field does not fit the type of its service.
+            TypeError: a field's value is of the wrong kind.
+        """
+        import yaml
+
+        content = yaml.safe_load(Path(path).read_text())
+        if not isinstance(content, dict) or content.get("rosasync-recording") != FORMAT:
+            raise ValueError(f"{path} is not a recording of format {FORMAT}")
+        return cls([_checked(path, entry) for entry in content.get("calls") or ()])
+
+
+def _checked(path: str | Path, entry: Any) -> RecordedCall:
+    try:
+        call = RecordedCall(**entry)
+    except TypeError as error:
+        raise ValueError(f"{path}: {entry!r} is not a recorded call: {error}") from None
+    kind = service_type(call.type)
+    to_message(kind.Request, call.request)
+    if call.response is not None:
+        to_message(kind.Response, call.response)
+    return call
+
+
+class _RecordingClient:
+    """A client port that records: a `rosasync.ports.ClientPort`."""
+
+    def __init__(
+        self, opener: OpenClient, service: Service, deliver: Deliver, recording: Recording
+    ) -> None:
+        self._service = service
+        self._deliver = deliver
+        self._recording = recording
+        self._unanswered: dict[int, RecordedCall] = {}
+        self._port = opener(service, self._answered)
+
+    def send(self, request: Any) -> int:
+        """Send a request and record it."""
+        name, kind, _ = self._service.key
+        call = RecordedCall(name, kind, to_dict(request))
+        number = self._port.send(request)
+        self._unanswered[number] = call
+        self._recording.calls.append(call)
+        return number
+
+    def forget(self, sequence_number: int) -> None:
+        """Stop expecting a response to this request."""
+        self._unanswered.pop(sequence_number, None)
+        self._port.forget(sequence_number)
+
+    def ready(self) -> bool:
+        """Return whether a server is matched."""
+        return self._port.ready()
+
+    def close(self) -> None:
+        """Destroy the client; idempotent."""
+        self._port.close()
+
+    def _answered(self, sequence_number: int, response: Any) -> None:
+        if (call := self._unanswered.pop(sequence_number, None)) is not None:
+            call.response = to_dict(response)
+        self._deliver(sequence_number, response)
+
+
+class _Listener:
+    """Records the introspection events of one service. Confined to the loop's thread.
+
+    If both sides publish, each call is seen twice: the first event of a kind counts.
+    """
+
+    def __init__(self, recording: Recording, srv_type: str, srv_name: str) -> None:
+        self.srv_name = srv_name
+        self._srv_type = srv_type
+        self._recording = recording
+        self._calls: dict[tuple[bytes, int], RecordedCall] = {}
+        # Whether the warning about events without contents was logged.
+        self._warned = False
+
+    def take(self, event: Any) -> None:
+        """Record an event."""
+        contents = [*event.request, *event.response]
+        if not contents:
+            self._warn()
+            return
+        key = bytes(bytearray(event.info.client_gid)), int(event.info.sequence_number)
+        call = self._calls.get(key)
+        if event.info.event_type in REQUESTS:
+            if call is None:
+                call = RecordedCall(self.srv_name, self._srv_type, to_dict(contents[0]))
+                self._calls[key] = call
+                self._recording.calls.append(call)
+        elif call is not None and call.response is None:
+            call.response = to_dict(contents[0])
+
+    def _warn(self) -> None:
+        if not self._warned:
+            self._warned = True
+            logger.warning(
+                "%s: its introspection events have no contents, so they cannot be recorded: use "
+                'introspection="contents"',
+                self.srv_name,
+            )
+
+
+if TYPE_CHECKING:
+
+    def _fits(client: _RecordingClient) -> ClientPort:
+        return client

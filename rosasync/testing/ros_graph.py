@@ -1,0 +1,227 @@
+"""Graph: one interface for tests, on a graph in memory or on real ROS."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Literal, Self
+
+from rosasync.errors import UsageError
+from rosasync.testing.graph import FakeGraph
+from rosasync.testing.hooks import GraphSession, Hooks
+from rosasync.testing.stub import STUB, Answer, StubServer
+
+if TYPE_CHECKING:
+    from rosasync.ports import Service
+    from rosasync.server import ServiceServer
+    from rosasync.session import Session
+    from rosasync.testing.recording import Recording
+
+__all__ = ["Graph"]
+
+
+class Graph:
+    """A ROS graph for one test: servers to call, and sessions that call them.
+
+    ::
+
+        async with Graph() as graph:
+            arm = graph.stub(SetBool, "/arm/enable", {"success": True})
+            async with graph.session() as session:
+                await enable_arm(session)
+            arm.assert_called_with(data=True)
+
+    The fixture ``ros_graph`` is an open one. Confined to the loop's thread.
+
+    Args:
+        kind: ``"memory"``, which needs no rclpy; or ``"real"``, for real ROS in a domain that only
+            this process uses. It sets ``ROS_DOMAIN_ID`` and ``ROS_AUTOMATIC_DISCOVERY_RANGE`` in
+            ``os.environ``, for child processes too.
+        strict: whether the end of the block raises ``AssertionError`` if a call found no server, a
+            stub had no answer left, or a server was never called.
+
+    Attributes:
+        kind: as given.
+        strict: as given; may be changed until the end.
+        servers: the servers, in the order of their creation.
+        unexpected: what the code under test called without an answer for it, as sentences.
+    """
+
+    def __init__(self, kind: Literal["memory", "real"] = "memory", *, strict: bool = False) -> None:
+        if kind not in ("memory", "real"):
+            raise ValueError(f"kind must be 'memory' or 'real', not {kind!r}")
+        self.kind = kind
+        self.strict = strict
+        self.servers: list[StubServer] = []
+        self.unexpected: list[str] = []
+        self._fake = FakeGraph() if kind == "memory" else None
+        self._hooks = Hooks()
+        self._stubs: Session | None = None
+
+    async def __aenter__(self) -> Self:
+        """Open the graph in the running loop.
+
+        Raises:
+            ImportError: rclpy is not installed, for real ROS.
+            RuntimeError: all ROS domains are taken.
+        """
+        if self._fake is None:
+            from rosasync.ros.domain import isolate_once
+
+            isolate_once()
+        self._stubs = await GraphSession(self._hooks, self._fake, "stubs").__aenter__()
+        return self
+
+    async def __aexit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """End the servers, and check what was called if the graph is strict.
+
+        Raises:
+            AssertionError: the graph is strict, and something was wrong.
+        """
+        for server in self.servers:
+            await server.vanish()
+        await self._open().aclose()
+        if self.strict and exc is None:
+            self.check()
+
+    def session(
+        self, node: Any = "test", *, recording: Recording | None = None, **options: Any
+    ) -> Session:
+        """Create a session in this graph, for the code under test.
+
+        Args:
+            node: as for `rosasync.Session`.
+            recording: records the calls of the session.
+            options: those of `rosasync.Session`.
+        """
+        if self._fake is None and isinstance(node, str):
+            # One participant of the middleware: its clients and servers match at once.
+            options.setdefault("context", self._open().node.context)
+        hooks = Hooks(on_missing=self._missing)
+        if recording is not None:
+            hooks.wrap_client = recording.wrap_client
+        return GraphSession(hooks, self._fake, node, **options)
+
+    def serve(
+        self,
+        srv_type: Any,
+        srv_name: str,
+        handler: Any = None,
+        *,
+        optional: bool = False,
+        **options: Any,
+    ) -> StubServer:
+        """Serve a service with a handler.
+
+        Args:
+            srv_type: a service class or its name.
+            srv_name: the service's name.
+            handler: every kind that `rosasync.Session.serve` takes, and it behaves as there. None
+                for ``async for call in server:``.
+            optional: whether a strict graph accepts that nobody calls it.
+            options: those of `rosasync.Session.serve`.
+
+        Raises:
+            TypeError, ValueError, InvalidServiceName: as `rosasync.Session.serve`.
+            UsageError: the graph is not open.
+        """
+        self._open()
+        server = StubServer(
+            srv_type,
+            srv_name,
+            handler,
+            options,
+            optional,
+            self._open_server,
+            self.unexpected.append,
+        )
+        self.servers.append(server)
+        return server
+
+    def stub(
+        self, srv_type: Any, srv_name: str, *answers: Answer, optional: bool = False, **options: Any
+    ) -> StubServer:
+        """Serve a service with fixed answers; further ones by `StubServer.answer`.
+
+        Args:
+            srv_type: a service class or its name.
+            srv_name: the service's name.
+            answers: the answers to all requests, as for `StubServer.answer`.
+            optional: whether a strict graph accepts that nobody calls it.
+            options: those of `rosasync.Session.serve`.
+
+        Raises:
+            TypeError, ValueError, InvalidServiceName: an argument does not fit.
+            UsageError: the graph is not open.
+        """
+        server = self.serve(srv_type, srv_name, STUB, optional=optional, **options)
+        return server.answer(*answers) if answers else server
+
+    def replay(self, recording: Recording, *, optional: bool = False) -> dict[str, StubServer]:
+        """Serve each service of a recording with its responses.
+
+        The same request gets its recorded responses in turn, and then the last one again. A
+        request that was not recorded stays unanswered, and a strict graph fails the test.
+
+        Args:
+            recording: the calls to replay.
+            optional: whether a strict graph accepts that nobody calls a service.
+
+        Returns:
+            The server of each service name.
+        """
+        servers: dict[str, StubServer] = {}
+        answers: dict[tuple[str, str], list[Answer]] = {}
+        requests: dict[tuple[str, str], Any] = {}
+        for call in recording.calls:
+            if call.service not in servers:
+                servers[call.service] = self.stub(call.type, call.service, optional=optional)
+            key = call.service, json.dumps(call.request, sort_keys=True, default=repr)
+            answers.setdefault(key, []).append(call.response)
+            requests[key] = call.request
+        for key, responses in answers.items():
+            server = servers[key[0]]
+            if len(responses) > 1:
+                server.answer(*responses, match=requests[key])
+            server.answer(responses[-1], match=requests[key])
+        return servers
+
+    def check(self) -> None:
+        """Check that every call had its answer, and every server a call.
+
+        Raises:
+            AssertionError: not so; the message lists what was wrong.
+        """
+        __tracebackhide__ = True
+        uncalled = [
+            f"{server.srv_name} was never called"
+            for server in self.servers
+            if not server.calls and not server.optional
+        ]
+        if problems := [*dict.fromkeys(self.unexpected), *uncalled]:
+            raise AssertionError("\n".join(["the graph is strict, and", *problems]))
+
+    def _open(self) -> Session:
+        if self._stubs is None:
+            raise UsageError("the graph is not open: use `async with Graph() as graph:`")
+        return self._stubs
+
+    def _open_server(
+        self, wrap: Callable[..., Any], *args: Any, **options: Any
+    ) -> ServiceServer[Any, Any]:
+        self._hooks.wrap_service = wrap
+        try:
+            return self._open().serve(*args, **options)
+        finally:
+            self._hooks.wrap_service = None
+
+    def _missing(self, service: Service) -> None:
+        name, kind, _ = service.key
+        if all(server.srv_name != name for server in self.servers):
+            self.unexpected.append(f"{name} ({kind}) was called, and has no server")

@@ -1,0 +1,301 @@
+"""StubServer: a server of a test, with its answers, its faults, and what it was asked."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Self, TypeAlias
+
+from rosasync.ros.messages import service_type, to_dict, to_message
+from rosasync.testing.faults import Faults, FaultyService, StubCall
+from rosasync.testing.matching import check_fields, count, describe, difference, matches
+
+if TYPE_CHECKING:
+    from rosasync.server import ServiceServer
+    from rosasync.service_call import ServiceCall
+
+__all__ = ["Answer", "Match", "StubCall", "StubServer"]
+
+Answer: TypeAlias = Any
+"""A response message, a mapping of its fields, an exception that the handler raises, or None for no
+answer at all."""
+
+Match: TypeAlias = Mapping[str, Any] | Callable[[Any], bool] | None
+"""Which requests: a mapping of the fields that count, a function of the request, None for all."""
+
+logger = logging.getLogger("rosasync")
+
+
+@dataclass
+class _Rule:
+    """Answers to the requests that match. A single one is repeated, several are given in turn."""
+
+    match: Match
+    answers: list[Answer]
+    repeated: bool
+
+    def fits(self, request: Any) -> bool:
+        if not self.answers:
+            return False
+        if callable(self.match):
+            return bool(self.match(request))
+        return self.match is None or matches(self.match, to_dict(request))
+
+    def take(self) -> Answer:
+        return self.answers[0] if self.repeated else self.answers.pop(0)
+
+
+class StubServer:
+    """A server in a `Graph`; created by `Graph.serve` and `Graph.stub`.
+
+    It is a `rosasync.ServiceServer` on the graph's own node, in memory or on real ROS. Confined to
+    the loop's thread.
+
+    Attributes:
+        calls: the requests received, in order, each with its response.
+        optional: whether a strict graph accepts that nobody calls it.
+    """
+
+    def __init__(
+        self,
+        srv_type: Any,
+        srv_name: str,
+        handler: Any,
+        options: Mapping[str, Any],
+        optional: bool,
+        open_server: Callable[..., ServiceServer[Any, Any]],
+        on_unexpected: Callable[[str], None],
+    ) -> None:
+        self.calls: list[StubCall] = []
+        self.optional = optional
+        self._type = service_type(srv_type)
+        self._name = srv_name
+        self._handler = self._answer if handler is STUB else handler
+        self._options = options
+        self._open_server = open_server
+        self._on_unexpected = on_unexpected
+        self._rules: list[_Rule] = []
+        self._faults = Faults()
+        self._changed = asyncio.Event()
+        self._server = self._open()
+
+    def __repr__(self) -> str:
+        state = "vanished" if self._server.closed else "up"
+        return f"<StubServer {self.srv_name} {state}, {count(len(self.calls), 'call')}>"
+
+    async def __aiter__(self) -> AsyncIterator[ServiceCall[Any, Any]]:
+        """Iterate over the calls, if `Graph.serve` was given no handler."""
+        async for call in self._server:
+            yield call
+
+    @property
+    def srv_name(self) -> str:
+        """The resolved service name."""
+        return self._server.srv_name
+
+    @property
+    def server(self) -> ServiceServer[Any, Any]:
+        """The server itself; another one after `come_back`."""
+        return self._server
+
+    @property
+    def requests(self) -> list[dict[str, Any]]:
+        """The fields of the requests received, in order, as plain values to compare."""
+        return [to_dict(call.request) for call in self.calls]
+
+    # Answers.
+
+    def answer(self, *answers: Answer, match: Match = None) -> Self:
+        """Answer requests of a server that `Graph.stub` created.
+
+        ::
+
+            lamp.answer({"success": False}, match={"data": False})
+            lamp.answer({"success": False}, {"success": True}, match={"data": True})
+            lamp.answer({"success": True})
+
+        For each request, the first rule that matches and has an answer left counts. If there is
+        none, the request stays unanswered, and a strict graph fails the test.
+
+        Args:
+            answers: a single one answers every request, several are given in turn, once each. A
+                response, a mapping of its fields, an exception that the handler raises (the request
+                then stays unanswered, as with any handler that fails), or None for no answer.
+            match: which requests: a mapping of the fields that count, or a function of the request.
+
+        Raises:
+            TypeError, ValueError: an answer or a field does not fit the service type.
+        """
+        if not answers:
+            raise ValueError(f"{self.srv_name}: answer() takes at least one answer")
+        if isinstance(match, Mapping):
+            check_fields(self._type.Request, match)
+        prepared = [self._prepare(answer) for answer in answers]
+        self._rules.append(_Rule(match, prepared, repeated=len(prepared) == 1))
+        return self
+
+    def _prepare(self, answer: Answer) -> Answer:
+        if isinstance(answer, Mapping):
+            return to_message(self._type.Response, answer)
+        if answer is None or isinstance(answer, (Exception, self._type.Response)):
+            return answer
+        if isinstance(answer, type) and issubclass(answer, Exception):
+            return answer
+        raise TypeError(
+            f"{self.srv_name}: an answer is a response, a mapping of its fields, an exception or "
+            f"None, not {type(answer).__name__}"
+        )
+
+    def _answer(self, call: ServiceCall[Any, Any]) -> Any:
+        rule = next((rule for rule in self._rules if rule.fits(call.request)), None)
+        if rule is None:
+            problem = f"{self.srv_name} has no answer left for {to_dict(call.request)}"
+            logger.warning("%s", problem)
+            self._on_unexpected(problem)
+        answer = None if rule is None else rule.take()
+        if answer is None:
+            call.give_up("left unanswered by the test")
+        elif isinstance(answer, (type, Exception)):
+            raise answer
+        return answer
+
+    # Faults.
+
+    def delay_responses(self, seconds: float) -> AbstractContextManager[None]:
+        """Delay responses by a number of seconds, in this block."""
+        return self._faults.set("delay", seconds)
+
+    def drop_requests(self) -> AbstractContextManager[None]:
+        """Lose every request that arrives in this block."""
+        return self._faults.set("dropping_requests", True)
+
+    def drop_responses(self) -> AbstractContextManager[None]:
+        """Lose every response that is sent in this block."""
+        return self._faults.set("dropping_responses", True)
+
+    def duplicate_responses(self) -> AbstractContextManager[None]:
+        """Send every response of this block twice."""
+        return self._faults.set("duplicating", True)
+
+    @contextmanager
+    def hold_responses(self) -> Iterator[None]:
+        """Hold every response of this block, and send it at the end of the block: late."""
+        try:
+            with self._faults.set("holding", True):
+                yield
+        finally:
+            self._faults.release()
+
+    async def vanish(self) -> None:
+        """Leave the graph, as a node that crashed; idempotent.
+
+        Running handlers are cancelled, and unanswered requests stay unanswered.
+        """
+        self._faults.held.clear()
+        await self._server.aclose(timeout=0)
+
+    def come_back(self) -> None:
+        """Enter the graph again, as a node that was restarted; does nothing if it is there."""
+        if self._server.closed:
+            self._server = self._open()
+
+    # What was called.
+
+    async def wait_for_calls(self, number: int = 1, timeout: float = 10.0) -> list[StubCall]:
+        """Wait until it has received a number of requests, and return them.
+
+        Raises:
+            AssertionError: it has not, after ``timeout`` seconds.
+        """
+        try:
+            async with asyncio.timeout(timeout):
+                while len(self.calls) < number:
+                    self._changed.clear()
+                    await self._changed.wait()
+        except TimeoutError:
+            raise self._failure(f"expected {count(number, 'call')} within {timeout:g} s") from None
+        return self.calls[:number]
+
+    def assert_called(self, times: int | None = None) -> None:
+        """Check that it was called, or how often.
+
+        Raises:
+            AssertionError: it was not; the message lists the requests.
+        """
+        __tracebackhide__ = True
+        if times is None and not self.calls:
+            raise self._failure("expected a call")
+        if times is not None and len(self.calls) != times:
+            raise self._failure(f"expected {count(times, 'call')}")
+
+    def assert_called_with(self, fields: Mapping[str, Any] | None = None, **more: Any) -> None:
+        """Check that one of the requests has these fields; others do not count.
+
+        Raises:
+            AssertionError: none has; the message lists the requests, and shows the difference from
+                the last one.
+            ValueError: the request has no such field.
+        """
+        __tracebackhide__ = True
+        expected = {**(fields or {}), **more}
+        check_fields(self._type.Request, expected)
+        requests = self.requests
+        if any(matches(expected, request) for request in requests):
+            return
+        shown = ""
+        if requests:
+            last = {name: requests[-1][name] for name in expected}
+            shown = f"\n{difference(expected, last)}"
+        raise self._failure(f"expected a call with {expected}", shown)
+
+    def assert_requests(self, *expected: Mapping[str, Any]) -> None:
+        """Check all requests, in order; of each, only the fields that are given count.
+
+        Raises:
+            AssertionError: they differ; the message shows where.
+            ValueError: the request has no such field.
+        """
+        __tracebackhide__ = True
+        for fields in expected:
+            check_fields(self._type.Request, fields)
+        requests = self.requests
+        if matches_all := len(expected) == len(requests):
+            matches_all = all(map(matches, expected, requests))
+        if not matches_all:
+            wanted = [dict(fields) for fields in expected]
+            shown = [
+                {name: request[name] for name in fields} if fields else request
+                for fields, request in zip(
+                    [*expected, *[{}] * len(requests)], requests, strict=False
+                )
+            ]
+            raise self._failure(
+                f"expected {count(len(expected), 'request')}", f"\n{difference(wanted, shown)}"
+            )
+
+    def _failure(self, expected: str, more: str = "") -> AssertionError:
+        return AssertionError(f"{self.srv_name}: {expected}, but {describe(self.requests)}{more}")
+
+    # Serving.
+
+    def _open(self) -> ServiceServer[Any, Any]:
+        return self._open_server(
+            lambda opener, service, deliver: FaultyService(
+                opener, service, deliver, self._faults, self._on_call
+            ),
+            self._type,
+            self._name,
+            self._handler,
+            **self._options,
+        )
+
+    def _on_call(self, call: StubCall) -> None:
+        self.calls.append(call)
+        self._changed.set()
+
+
+STUB = object()
+"""The handler of a server whose answers are given by `StubServer.answer`."""
