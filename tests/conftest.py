@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import importlib
+import os
 import logging
 import signal
 import threading
@@ -136,6 +137,16 @@ def lamp() -> Iterator[ServerProcess]:
         server.serve_now("/lamp/text")
         server.serve_now("/lamp/twice", "std_srvs/srv/SetBool", copies=2)
         yield server
+
+
+@pytest.fixture(scope="module")
+def own_domain() -> Iterator[None]:
+    """A ROS domain for one module: its child processes see no node of another test."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE"):
+            patch.setenv(name, os.environ[name])
+        isolate()
+        yield
 
 
 @pytest.fixture

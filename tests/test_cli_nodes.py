@@ -16,21 +16,16 @@ import yaml
 
 from rosasync.cli.param import read_value
 from rosasync.parameters import ParameterType
-from rosasync.ros.domain import isolate
 from tests.support.managed import NodesProcess
 from tests.support.process import ROOT
 from tests.support.times import LIMIT, TICK
 
 
 @pytest.fixture(scope="module")
-def nodes() -> Iterator[NodesProcess]:
-    """A process of stock nodes, in a domain without the nodes of other tests."""
-    with pytest.MonkeyPatch.context() as patch:
-        for name in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE"):
-            patch.setenv(name, os.environ[name])
-        isolate()
-        with NodesProcess() as nodes:
-            yield nodes
+def nodes(own_domain: None) -> Iterator[NodesProcess]:
+    """A process of stock nodes, for all tests of this module."""
+    with NodesProcess() as nodes:
+        yield nodes
 
 
 async def run(*arguments: str) -> subprocess.CompletedProcess[str]:

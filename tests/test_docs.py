@@ -207,6 +207,9 @@ def with_sorted(text: str, part: slice) -> str:
     return "\n".join(lines)
 
 
+pytestmark = pytest.mark.usefixtures("own_domain")
+
+
 @pytest.fixture(scope="module")
 def servers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Servers]:
     servers = Servers(tmp_path_factory.mktemp("servers"))
