@@ -19,8 +19,6 @@ from dataclasses import astuple, dataclass, replace
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
-import pytest
-
 import rosasync
 from rosasync import Session
 from tests.support.echo import ECHO, request_of
@@ -28,9 +26,6 @@ from tests.support.times import LIMIT
 
 if TYPE_CHECKING:
     from rosasync.testing import FakeGraph
-
-# A measurement of coverage allocates memory in every line.
-pytestmark = pytest.mark.no_cover
 
 CALLS = 150
 BATCHES = 4

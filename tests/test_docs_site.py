@@ -32,7 +32,7 @@ PAINS = {
 }
 """What a user with each of the known pains types into the search box."""
 
-FEW = 12
+FEW = 16
 """A search that finds more pages than these does not help."""
 
 

@@ -143,6 +143,10 @@ class FaultyService:
         """Return whether the graph shows a client."""
         return self._port.has_clients()
 
+    def delivered(self) -> bool:
+        """Return whether every client has received every response that was let through."""
+        return self._port.delivered()
+
     def stop(self) -> None:
         """Stop delivering requests; idempotent."""
         self._port.stop()

@@ -35,14 +35,14 @@ class RecordedCall:
     """A call and its response, as plain values.
 
     Attributes:
-        service: the resolved name of the service.
-        type: the name of its type.
+        srv_name: the resolved name of the service.
+        srv_type: the name of its type.
         request: the fields of the request.
         response: the fields of the response; None if it was not answered.
     """
 
-    service: str
-    type: str
+    srv_name: str
+    srv_type: str
     request: dict[str, Any]
     response: dict[str, Any] | None = None
 
@@ -149,7 +149,7 @@ def _checked(path: str | Path, entry: Any) -> RecordedCall:
         call = RecordedCall(**entry)
     except TypeError as error:
         raise ValueError(f"{path}: {entry!r} is not a recorded call: {error}") from None
-    kind = service_type(call.type)
+    kind = service_type(call.srv_type)
     to_message(kind.Request, call.request)
     if call.response is not None:
         to_message(kind.Response, call.response)

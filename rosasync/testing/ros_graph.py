@@ -180,9 +180,9 @@ class Graph:
         answers: dict[tuple[str, str], list[Answer]] = {}
         requests: dict[tuple[str, str], Any] = {}
         for call in recording.calls:
-            if call.service not in servers:
-                servers[call.service] = self.stub(call.type, call.service, optional=optional)
-            key = call.service, json.dumps(call.request, sort_keys=True, default=repr)
+            if call.srv_name not in servers:
+                servers[call.srv_name] = self.stub(call.srv_type, call.srv_name, optional=optional)
+            key = call.srv_name, json.dumps(call.request, sort_keys=True, default=repr)
             answers.setdefault(key, []).append(call.response)
             requests[key] = call.request
         for key, responses in answers.items():
