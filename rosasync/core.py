@@ -135,14 +135,13 @@ class Core:
         if session is not None and not self.closed:
             _warn_unclosed(session)
             self.closed = True
-        elif self.closed and self.loop.is_closed():
+        elif self.closed and self._end_task is None and self.loop.is_closed():
             self._cleaned_up.wait(END_TIMEOUT)
         self.node.stop()
         self.gateway.close()
         self.node.join()
 
     async def _end(self) -> None:
-        atexit.unregister(self._exit)
         # Each step also if the end of the loop cancels this task, as `asyncio.run` does.
         try:
             await asyncio.gather(*(server.aclose() for server in self.servers))
@@ -167,6 +166,8 @@ class Core:
                     "a callback of node %s still runs: its executor thread is left behind",
                     self.name,
                 )
+            # Last: if a second Ctrl-C interrupts the end, the interpreter's exit completes it.
+            atexit.unregister(self._exit)
 
     def _graph_changed(self) -> None:
         self.pool.graph_changed()

@@ -14,7 +14,7 @@ from rclpy.node import Node
 from rosasync.errors import RosasyncError
 from rosasync.ports import Deliver, DeliverRequest
 from rosasync.ros.busy_poll import BusyPoll
-from rosasync.ros.failures import RclpyError, explain, is_destroyed
+from rosasync.ros.failures import RclpyError, check_up, explain, is_destroyed
 from rosasync.ros.rcl import Rcl
 from rosasync.ros.responder import Responder
 from rosasync.ros.services import make_service, qos_of, take_requests
@@ -280,6 +280,7 @@ class DirectClient:
         if self._rcl.signal_responses(self.handle, self._signal.fd):
             self._signalling = True
         elif not is_destroyed(self.handle):
+            check_up(self._node)
             raise RosasyncError(
                 "the middleware does not support new-response callbacks: use bridge='executor'"
             )
@@ -328,6 +329,7 @@ class DirectService:
         self._signal = signals.join(self)
         if not rcl.signal_requests(self._service, self._signal.fd):
             self.close()
+            check_up(node)
             raise RosasyncError(
                 "the middleware does not support new-request callbacks: use bridge='executor'"
             )
