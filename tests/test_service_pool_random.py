@@ -51,6 +51,7 @@ class Run:
         self.servers: list[FakeServer] = []
         self.tasks: dict[asyncio.Task[Any], int] = {}
         self.in_line: set[int] = set()
+        self.open_leases = 0
         self.session: Session
         self.service: ServicePool
 
@@ -112,15 +113,19 @@ class Run:
     def lease(self, number: int) -> asyncio.Task[Any]:
         async def use() -> Any:
             async with self.session.pool.lease(Echo, "/echo", timeout=self.seconds()) as leased:
-                for _ in range(3):
+                self.open_leases += 1
+                try:
+                    for _ in range(3):
+                        await asyncio.sleep(0)
+                        response = await leased.call(
+                            Echo.Request(number), timeout=4 * SHORT, retry=self.retry(0.5)
+                        )
+                    # One that outlives the lease, or is cancelled before it ends.
+                    late = asyncio.create_task(leased.call(Echo.Request(number), timeout=SHORT))
+                    self.tasks[late] = number
                     await asyncio.sleep(0)
-                    response = await leased.call(
-                        Echo.Request(number), timeout=4 * SHORT, retry=self.retry(0.5)
-                    )
-                # One that outlives the lease.
-                late = asyncio.create_task(leased.call(Echo.Request(number), timeout=SHORT))
-                self.tasks[late] = number
-                await asyncio.sleep(0)
+                finally:
+                    self.open_leases -= 1
             return response
 
         return asyncio.create_task(use())
@@ -171,8 +176,10 @@ class Run:
         assert len(self.service.clients) <= self.limits.clients
         for client in self.service.clients:
             assert 0 <= client.leases <= self.limits.in_flight
-            # Each has a place, or is an attempt that is known or presumed to have left the queue.
-            assert client.leases + client.abandoned <= max(client.window, self.limits.in_flight)
+            # Each has a place, or is an attempt that is known or presumed to have left the queue. A
+            # lease whose call was cancelled waits for its place before the next call.
+            places = max(client.window, self.limits.in_flight) + self.open_leases
+            assert client.leases + client.abandoned <= places
         for task in [task for task in self.tasks if task.done()]:
             number = self.tasks.pop(task)
             if task.cancelled():
