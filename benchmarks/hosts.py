@@ -8,7 +8,7 @@ import subprocess
 from contextlib import ExitStack
 from types import TracebackType
 
-__all__ = ["ENVIRONMENT", "Hosts", "NoHosts", "run_ip"]
+__all__ = ["ENVIRONMENT", "Hosts", "NoHosts", "bring_up", "check_namespaces", "run_ip"]
 
 ENVIRONMENT = {
     "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",
@@ -35,10 +35,7 @@ class Hosts:
         self._stack = ExitStack()
 
     def __enter__(self) -> Hosts:
-        if shutil.which("ip") is None:
-            raise NoHosts("`ip` is missing: install iproute2")
-        if os.geteuid() != 0:
-            raise NoHosts("network namespaces need root")
+        check_namespaces()
         with self._stack:
             for name in self._names:
                 run_ip("netns", "add", name)
@@ -47,10 +44,7 @@ class Hosts:
             cable = ["type", "veth", "peer", "name", "eth0", "netns", client]
             run_ip("link", "add", "eth0", "netns", server, *cable)
             for number, name in enumerate(self._names, 1):
-                run_ip("-n", name, "address", "add", f"10.0.0.{number}/24", "dev", "eth0")
-                for link in ("lo", "eth0"):
-                    run_ip("-n", name, "link", "set", link, "up")
-                run_ip("-n", name, "route", "add", "224.0.0.0/4", "dev", "eth0")
+                bring_up(name, f"10.0.0.{number}")
             self._stack = self._stack.pop_all()
         return self
 
@@ -71,6 +65,23 @@ class Hosts:
     def on_client(self) -> list[str]:
         """The prefix of a command that runs on the contestants' host."""
         return ["ip", "netns", "exec", self._names[1]]
+
+
+def check_namespaces() -> None:
+    """Raise NoHosts if network namespaces cannot be made here."""
+    if shutil.which("ip") is None:
+        raise NoHosts("`ip` is missing: install iproute2")
+    if os.geteuid() != 0:
+        raise NoHosts("network namespaces need root")
+
+
+def bring_up(namespace: str, address: str) -> None:
+    """Give the device ``eth0`` of a namespace an address, and start it with a multicast route."""
+    inside = ["-n", namespace]
+    run_ip(*inside, "address", "add", f"{address}/24", "dev", "eth0")
+    for device in ("lo", "eth0"):
+        run_ip(*inside, "link", "set", device, "up")
+    run_ip(*inside, "route", "add", "224.0.0.0/4", "dev", "eth0")
 
 
 def run_ip(*arguments: str) -> None:

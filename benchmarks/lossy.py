@@ -7,7 +7,6 @@ import fcntl
 import os
 import random
 import select
-import shutil
 import struct
 import sys
 import threading
@@ -19,7 +18,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from benchmarks.hosts import ENVIRONMENT, NoHosts, run_ip
+from benchmarks.hosts import ENVIRONMENT, NoHosts, bring_up, check_namespaces, run_ip
 from benchmarks.pipes import Child, answer_lines
 
 __all__ = ["LossyHosts"]
@@ -69,10 +68,7 @@ class LossyHosts:
         self._stack = ExitStack()
 
     def __enter__(self) -> LossyHosts:
-        if shutil.which("ip") is None:
-            raise NoHosts("`ip` is missing: install iproute2")
-        if os.geteuid() != 0:
-            raise NoHosts("network namespaces need root")
+        check_namespaces()
         if not Path("/dev/net/tun").exists():
             raise NoHosts("/dev/net/tun is missing")
         with self._stack:
@@ -84,7 +80,7 @@ class LossyHosts:
             self._switch = self._stack.enter_context(Child("benchmarks.lossy", *namespaces))
             self.set(**self._link)
             for name in self._names:
-                self._bring_up(name)
+                bring_up(self.namespace(name), self.address(name))
             self._stack = self._stack.pop_all()
         return self
 
@@ -116,13 +112,6 @@ class LossyHosts:
         """Return the number of ``frames`` and ``bytes`` sent so far, and of frames ``lost``."""
         counts: dict[str, int] = self._switch.ask("counts", timeout=PATIENCE)
         return counts
-
-    def _bring_up(self, name: str) -> None:
-        inside = ["-n", self.namespace(name)]
-        run_ip(*inside, "address", "add", f"{self.address(name)}/24", "dev", "eth0")
-        for device in ("lo", "eth0"):
-            run_ip(*inside, "link", "set", device, "up")
-        run_ip(*inside, "route", "add", "224.0.0.0/4", "dev", "eth0")
 
 
 class Switch:

@@ -16,6 +16,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from rosasync import CallError, ResponseTimeout, RosasyncError
+from rosasync.node_client import NodeClient
 
 if TYPE_CHECKING:
     from rosasync import Session
@@ -158,7 +159,7 @@ TRANSITIONS = {
 }
 
 
-class LifecycleClient:
+class LifecycleClient(NodeClient):
     """Reads the state of a lifecycle node, and changes it.
 
     It owns nothing: its calls share the clients of the session's pool. So many nodes may be
@@ -186,20 +187,7 @@ class LifecycleClient:
     """
 
     def __init__(self, session: Session, node_name: str, *, timeout: Timeout = ...) -> None:
-        service = session.client(
-            "lifecycle_msgs/srv/GetState", f"{node_name}/get_state", timeout=timeout
-        )
-        self._session = session
-        self._timeout = timeout
-        self._node_name = service.srv_name.removesuffix("/get_state")
-
-    def __repr__(self) -> str:
-        return f"<LifecycleClient {self._node_name}>"
-
-    @property
-    def node_name(self) -> str:
-        """The node's full name."""
-        return self._node_name
+        super().__init__(session, node_name, timeout, "lifecycle_msgs/srv/GetState", "get_state")
 
     async def state(self, *, timeout: Timeout = ...) -> LifecycleState:
         """Return the node's state.
@@ -318,12 +306,7 @@ class LifecycleClient:
     async def _call(
         self, service: str, name: str, request: dict[str, Any], timeout: Timeout
     ) -> Any:
-        return await self._session.call(
-            f"lifecycle_msgs/srv/{service}",
-            f"{self._node_name}/{name}",
-            request,
-            timeout=self._timeout if timeout is ... else timeout,
-        )
+        return await self._call_node(f"lifecycle_msgs/srv/{service}", name, request, timeout)
 
 
 def _state(message: Any) -> LifecycleState:

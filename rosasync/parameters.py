@@ -38,6 +38,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, overload
 import anyio
 
 from rosasync import RosasyncError, to_dict
+from rosasync.node_client import NodeClient
 
 if TYPE_CHECKING:
     from rosasync import Session
@@ -160,7 +161,7 @@ class ParameterError(RosasyncError):
         return self.reasons[self.name]
 
 
-class ParameterClient:
+class ParameterClient(NodeClient):
     """Reads and writes the parameters of another node.
 
     It owns nothing: its calls share the clients of the session's pool. So many of them may be
@@ -187,20 +188,9 @@ class ParameterClient:
     """
 
     def __init__(self, session: Session, node_name: str, *, timeout: Timeout = ...) -> None:
-        service = session.client(
-            "rcl_interfaces/srv/GetParameters", f"{node_name}/get_parameters", timeout=timeout
+        super().__init__(
+            session, node_name, timeout, "rcl_interfaces/srv/GetParameters", "get_parameters"
         )
-        self._session = session
-        self._timeout = timeout
-        self._node_name = service.srv_name.removesuffix("/get_parameters")
-
-    def __repr__(self) -> str:
-        return f"<ParameterClient {self._node_name}>"
-
-    @property
-    def node_name(self) -> str:
-        """The node's full name."""
-        return self._node_name
 
     @overload
     async def get(self, names: str, /, *, timeout: Timeout = ...) -> Any: ...
@@ -384,12 +374,7 @@ class ParameterClient:
 
     async def _call(self, service: str, request: Mapping[str, Any], timeout: Timeout) -> Any:
         name = re.sub("(?<=[a-z])([A-Z])", r"_\1", service).lower()
-        return await self._session.call(
-            f"rcl_interfaces/srv/{service}",
-            f"{self._node_name}/{name}",
-            request,
-            timeout=self._timeout if timeout is ... else timeout,
-        )
+        return await self._call_node(f"rcl_interfaces/srv/{service}", name, request, timeout)
 
     async def _ask_all(
         self, service: str, field: str, names: str | Several, timeout: Timeout

@@ -115,7 +115,7 @@ class TestFastRetransmit:
                 once = start(session, "lost", retry=Retry(attempts=1))
                 port = next(iter(fake_graph.nodes[0].clients))
                 for number in range(4, 10):
-                    # The answer to a request that nobody has made: only its number counts.
+                    # The answer to a request that was never made: only its number counts.
                     port.deliver(number, Echo.Response())
             assert session.pool.statistics().retried == 1
             for task in (lost, once):

@@ -37,7 +37,7 @@ no server or client of {name} publishes introspection, so nothing can be seen. S
 
 @asynccontextmanager
 async def switched_on(session: rosasync.Session, name: str) -> AsyncIterator[None]:
-    """Switch introspection of a service on if nobody publishes it, and back at the end.
+    """Switch introspection of a service on if no process publishes it, and back at the end.
 
     If it cannot be switched on, say how.
     """

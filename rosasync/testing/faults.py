@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from rosasync.ports import DeliverRequest, RequestHeader, Service, ServicePort
     from rosasync.testing.hooks import OpenService
 
-__all__ = ["Faults", "FaultyService", "StubCall"]
+__all__ = ["Faults", "FaultyService", "StubCall", "set_in_block"]
 
 REMATCH = 0.05
 """Seconds after which a response is sent again to a client that is not fully discovered."""
@@ -55,21 +55,22 @@ class Faults:
     holding: bool = False
     held: list[Callable[[], None]] = field(default_factory=list)
 
-    @contextmanager
-    def set(self, name: str, value: object) -> Iterator[None]:
-        """Set one of the attributes in this block."""
-        before = getattr(self, name)
-        setattr(self, name, value)
-        try:
-            yield
-        finally:
-            setattr(self, name, before)
-
     def release(self) -> None:
         """Send the responses that were held back."""
         held, self.held = self.held, []
         for send in held:
             send()
+
+
+@contextmanager
+def set_in_block(owner: object, name: str, value: object) -> Iterator[None]:
+    """Set an attribute in this block."""
+    before = getattr(owner, name)
+    setattr(owner, name, value)
+    try:
+        yield
+    finally:
+        setattr(owner, name, before)
 
 
 class FaultyService:

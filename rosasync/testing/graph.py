@@ -28,6 +28,7 @@ from rosasync.ports import Deliver, DeliverRequest, Service, Undeliverable
 from rosasync.ros.messages import request_message, service_type, type_name
 from rosasync.session import Session
 from rosasync.statistics import ServiceKey
+from rosasync.testing.faults import set_in_block
 
 __all__ = [
     "FakeClient",
@@ -213,34 +214,25 @@ class FakeGraph:
 
     def delay_responses(self, seconds: float) -> AbstractContextManager[None]:
         """Delay responses by a number of seconds, in this block."""
-        return self._set_in_block("delay", seconds)
+        return set_in_block(self, "delay", seconds)
 
     def drop_requests(self) -> AbstractContextManager[None]:
         """Lose every request that is sent in this block."""
-        return self._set_in_block("dropping_requests", True)
+        return set_in_block(self, "dropping_requests", True)
 
     def drop_responses(self) -> AbstractContextManager[None]:
         """Lose the response to every request that is handled in this block."""
-        return self._set_in_block("dropping_responses", True)
+        return set_in_block(self, "dropping_responses", True)
 
     @contextmanager
     def hold_requests(self) -> Iterator[None]:
         """Queue requests in this block, up to each server's depth, and handle them at its end."""
         try:
-            with self._set_in_block("holding", True):
+            with set_in_block(self, "holding", True):
                 yield
         finally:
             for server in tuple(self.servers):
                 server.handle_queued()
-
-    @contextmanager
-    def _set_in_block(self, name: str, value: object) -> Iterator[None]:
-        before = getattr(self, name)
-        setattr(self, name, value)
-        try:
-            yield
-        finally:
-            setattr(self, name, before)
 
     def find(self, srv_type: str, srv_name: str) -> list[FakeServer]:
         """Return the servers of a service, by the names of its type and the service."""

@@ -124,7 +124,7 @@ class Graph:
             srv_name: the service's name.
             handler: every kind that `rosasync.Session.serve` takes, and it behaves as there. None
                 for ``async for call in server:``.
-            optional: whether a strict graph accepts that nobody calls it.
+            optional: whether a strict graph accepts that it is never called.
             options: those of `rosasync.Session.serve`.
 
         Raises:
@@ -153,7 +153,7 @@ class Graph:
             srv_type: a service class or its name.
             srv_name: the service's name.
             answers: the answers to all requests, as for `StubServer.answer`.
-            optional: whether a strict graph accepts that nobody calls it.
+            optional: whether a strict graph accepts that it is never called.
             options: those of `rosasync.Session.serve`.
 
         Raises:
@@ -171,7 +171,7 @@ class Graph:
 
         Args:
             recording: the calls to replay.
-            optional: whether a strict graph accepts that nobody calls a service.
+            optional: whether a strict graph accepts that a service is never called.
 
         Returns:
             The server of each service name.

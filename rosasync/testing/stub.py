@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self, TypeAlias
 
 from rosasync.ros.messages import service_type, to_dict, to_message
-from rosasync.testing.faults import Faults, FaultyService, StubCall
+from rosasync.testing.faults import Faults, FaultyService, StubCall, set_in_block
 from rosasync.testing.matching import check_fields, count, describe, difference, matches
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ class StubServer:
 
     Attributes:
         calls: the requests received, in order, each with its response.
-        optional: whether a strict graph accepts that nobody calls it.
+        optional: whether a strict graph accepts that it is never called.
     """
 
     def __init__(
@@ -166,25 +166,25 @@ class StubServer:
 
     def delay_responses(self, seconds: float) -> AbstractContextManager[None]:
         """Delay responses by a number of seconds, in this block."""
-        return self._faults.set("delay", seconds)
+        return set_in_block(self._faults, "delay", seconds)
 
     def drop_requests(self) -> AbstractContextManager[None]:
         """Lose every request that arrives in this block."""
-        return self._faults.set("dropping_requests", True)
+        return set_in_block(self._faults, "dropping_requests", True)
 
     def drop_responses(self) -> AbstractContextManager[None]:
         """Lose every response that is sent in this block."""
-        return self._faults.set("dropping_responses", True)
+        return set_in_block(self._faults, "dropping_responses", True)
 
     def duplicate_responses(self) -> AbstractContextManager[None]:
         """Send every response of this block twice."""
-        return self._faults.set("duplicating", True)
+        return set_in_block(self._faults, "duplicating", True)
 
     @contextmanager
     def hold_responses(self) -> Iterator[None]:
         """Hold every response of this block, and send it at the end of the block: late."""
         try:
-            with self._faults.set("holding", True):
+            with set_in_block(self._faults, "holding", True):
                 yield
         finally:
             self._faults.release()

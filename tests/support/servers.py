@@ -215,7 +215,7 @@ class _Service:
                 self.changed.notify_all()
 
     def _forge(self, send: Callable[[Any, Any], None], response: Any, header: Any) -> None:
-        """Send a wrong response under numbers that nobody waits for."""
+        """Send a wrong response under numbers that no call waits for."""
         forged = type(response)(message="forged")
         identity = header.request_id
         number = _number_of(identity)
