@@ -118,6 +118,23 @@ def read_to_end(fd: int) -> bytes:
     return seen
 
 
+def test_ctrl_c_ends_a_command_whose_loop_sleeps() -> None:
+    """The signal comes on another thread, so it does not interrupt the sleep by itself."""
+    code = (
+        "import asyncio, signal, threading, time\n"
+        "from rosasync.cli.run import run\n"
+        "def strike():\n"
+        "    time.sleep(0.2)\n"
+        "    signal.pthread_kill(threading.get_ident(), signal.SIGINT)\n"
+        "async def command():\n"
+        "    threading.Thread(target=strike).start()\n"
+        "    await asyncio.Event().wait()\n"
+        "run(command())\n"
+    )
+    done = run(sys.executable, "-c", code)
+    assert "Exit: 130" in done.stderr.splitlines()[-1]
+
+
 def test_ctrl_c_ends_the_demo_and_its_server() -> None:
     command = (*ROSASYNC, "demo", "--json", "--calls", "1000000", "--seconds", "60")
     with terminal() as (screen, stderr):

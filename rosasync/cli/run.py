@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import os
+import signal
+import socket
 import sys
 from collections.abc import Coroutine
 from contextlib import suppress
@@ -24,7 +26,7 @@ def run(command: Coroutine[Any, Any, int | None]) -> None:
         typer.Exit: always, with the exit code.
     """
     try:
-        code = asyncio.run(command) or Code.ANSWERED
+        code = asyncio.run(_woken_by_signals(command)) or Code.ANSWERED
         sys.stdout.flush()
     except KeyboardInterrupt:
         code = Code.INTERRUPTED
@@ -35,6 +37,26 @@ def run(command: Coroutine[Any, Any, int | None]) -> None:
         fail(error)
         code = code_of(error)
     raise typer.Exit(int(code))
+
+
+async def _woken_by_signals(command: Coroutine[Any, Any, int | None]) -> int | None:
+    """Await a command, and wake the loop at every signal.
+
+    `asyncio.run` handles Ctrl-C in Python code. An idle loop runs none until its next event, if the
+    signal comes just before it sleeps, or on a thread of the middleware.
+    """
+    loop = asyncio.get_running_loop()
+    reader, writer = socket.socketpair()
+    with reader, writer:
+        reader.setblocking(False)
+        writer.setblocking(False)
+        loop.add_reader(reader, reader.recv, 4096)
+        previous = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
+        try:
+            return await command
+        finally:
+            signal.set_wakeup_fd(previous)
+            loop.remove_reader(reader)
 
 
 def open_session(
