@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from tests.support.command import LAMP, LAMP_TYPE, json_lines, rosasync, terminal
+from tests.support.command import LAMP, LAMP_TYPE, json_lines, own, rosasync, terminal
 from tests.support.process import ROOT
 from tests.support.servers import ServerProcess
 
@@ -188,4 +188,4 @@ def test_a_closed_pipe_ends_it_quietly() -> None:
     )
     assert done.returncode == 141
     assert len(json_lines(done.stdout)) == 1
-    assert done.stderr == ""
+    assert own(done.stderr) == ""

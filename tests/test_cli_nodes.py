@@ -16,6 +16,7 @@ import yaml
 
 from rosasync.cli.param import read_value
 from rosasync.parameters import ParameterType
+from tests.support.command import own, rosasync
 from tests.support.managed import NodesProcess
 from tests.support.process import ROOT
 from tests.support.times import LIMIT, TICK
@@ -29,10 +30,7 @@ def nodes(own_domain: None) -> Iterator[NodesProcess]:
 
 
 async def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-    command = (sys.executable, "-m", "rosasync", *arguments)
-    return await asyncio.to_thread(
-        subprocess.run, command, cwd=ROOT, capture_output=True, text=True, timeout=6 * LIMIT
-    )
+    return await asyncio.to_thread(rosasync, *arguments)
 
 
 async def printed(*arguments: str) -> str:
@@ -155,7 +153,7 @@ async def run_example(example: str, folder: Path) -> None:
         text=True,
         timeout=6 * LIMIT,
     )
-    assert (done.returncode, done.stderr) == (0, ""), example
+    assert (done.returncode, own(done.stderr)) == (0, ""), example
 
 
 @pytest.mark.parametrize(
