@@ -183,11 +183,12 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
         in_task = False
         try:
             result = self._kind.invoke(call)
-            if result is not None and inspect.isawaitable(result):
+            # The response first, because `isawaitable` is slow.
+            if isinstance(result, self._sender.response_type) or not inspect.isawaitable(result):
+                self._finish(call, result)
+            else:
                 in_task = True
                 self._tasks.spawn(self._await_handler(call, result))
-            else:
-                self._finish(call, result)
         except BaseException as error:
             self._contain(call, error, self._fail)
         finally:

@@ -132,8 +132,7 @@ class Responder:
         unreached = self._check(header) if self._watching else None
         started = monotonic()
         try:
-            with self._handle:
-                self._send(response, header.request_id)
+            self._send(response, header.request_id)
         except RclpyError as error:
             raise self._failure(error) from error
         except SystemError as error:
