@@ -123,11 +123,10 @@ def section(trials: Trials, out: Path) -> str:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a plot as SVG and PNG, the same bytes for the same plot."""
+    """Write a plot as SVG, the same bytes for the same plot."""
     matplotlib.rcParams["svg.hashsalt"] = "rosasync"
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, metadata={"Date": None})
-    figure.savefig(path.with_suffix(".png"), dpi=120)
 
 
 @contextmanager
