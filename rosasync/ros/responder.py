@@ -132,7 +132,9 @@ class Responder:
         unreached = self._check(header) if self._watching else None
         started = monotonic()
         try:
-            self._send(response, header.request_id)
+            # It raises for a destroyed service even while an executor still holds it.
+            with self._handle:
+                self._send(response, header.request_id)
         except RclpyError as error:
             raise self._failure(error) from error
         except SystemError as error:
