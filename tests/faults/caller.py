@@ -84,6 +84,8 @@ class _Callers:
 
     def __init__(self) -> None:
         self._enough = threading.Event()
+        # Whether a last call has to be answered.
+        self._stopped = False
         self._thread: threading.Thread | None = None
         self._trial: Trial | None = None
         self._failure: BaseException | None = None
@@ -100,6 +102,7 @@ class _Callers:
         return self._trial.row.answered if self._trial is not None else 0
 
     def stop(self) -> str:
+        self._stopped = True
         self.end()
         if self._failure is not None:
             raise self._failure
@@ -153,8 +156,9 @@ class _Callers:
                 group.create_task(self._watch_memory(trial))
                 for _ in range(callers):
                     group.create_task(caller())
-            how = await trial.call(session, name, timeout=4 * LIMIT, retry=PATIENT)
-            assert how == "answered", how
+            if self._stopped:
+                how = await trial.call(session, name, timeout=4 * LIMIT, retry=PATIENT)
+                assert how == "answered", how
             trial.row.notes.append(f"{session.pool.statistics().retried:,} requests sent again")
         await trial.finish()
 

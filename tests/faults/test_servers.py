@@ -128,11 +128,12 @@ async def test_never_answering(trial: Trial, server: ServerProcess, full: bool) 
 
 
 async def test_one_of_two_ends(trial: Trial, server: ServerProcess, full: bool) -> None:
+    """With Retry: the queue of the other one may have overflowed while this one answered."""
     await server.serve("/two")
     async with (
         ServerProcess() as other,
         trial.session() as session,
-        trial.callers(session, "/two", 20, timeout=LIMIT),
+        trial.callers(session, "/two", 20, timeout=LIMIT, retry=PATIENT),
     ):
         await trial.more_answers(20)
         for _ in range(20 if full else 2):
