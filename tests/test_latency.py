@@ -65,6 +65,8 @@ def test_memory_is_taken_for_new_powers_of_two_only() -> None:
     assert list(spread.octaves[16]) == [1024] * 32
 
 
+# uvloop's own time stands still while callbacks run.
+@pytest.mark.asyncio(loop_factories=["asyncio", "uvloop"])
 async def test_the_statistics_of_a_session(session: Session, server: ServerProcess) -> None:
     await server.serve("/echo")
     await server.serve("/slow", delay=3 * TICK)

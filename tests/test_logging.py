@@ -145,8 +145,9 @@ class TestTheLevel:
         monkeypatch.setattr("rosasync.tracing.RECHECK_NS", 0)
         logging.getLogger("rosasync").setLevel(logging.DEBUG)
         try:
-            while not traces:
-                await ask(session, echo, "x")
+            async with asyncio.timeout(LIMIT):
+                while not traces:
+                    await ask(session, echo, "x")
         finally:
             logging.getLogger("rosasync").setLevel(logging.NOTSET)
 
@@ -155,8 +156,9 @@ class TestTheLevel:
     ) -> None:
         await ask(session, echo, "x")
         with caplog.at_level(logging.DEBUG, "rosasync"):
-            while not has(caplog, r"#\d+ /echo: answered after T"):
-                await ask(session, echo, "x")
+            async with asyncio.timeout(LIMIT):
+                while not has(caplog, r"#\d+ /echo: answered after T"):
+                    await ask(session, echo, "x")
         caplog.clear()
         await ask(session, echo, "x")
         assert not caplog.messages

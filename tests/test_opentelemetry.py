@@ -104,6 +104,18 @@ class TestSpans:
             times = [span.start_time, *(event.timestamp for event in span.events), span.end_time]
             assert times == sorted(times)  # type: ignore[type-var]
 
+    async def test_a_request_has_no_parent(
+        self, fake_graph: FakeGraph, telemetry: Telemetry
+    ) -> None:
+        """The context in which the loop delivers a request may be that of any task."""
+        tracer = telemetry.tracers.get_tracer("test")
+        with tracer.start_as_current_span("opening"):
+            async with fake_graph.session(trace=telemetry.trace) as session:
+                session.serve(ECHO, "/served", echo_call)
+                await ask(session, "/served", "x")
+        (server,) = telemetry.spans(SpanKind.SERVER)
+        assert server.parent is None
+
     @pytest.mark.parametrize("asynchronous", [True, False])
     async def test_the_calls_of_a_handler_are_below_its_request(
         self, observed: Session, telemetry: Telemetry, echo: str, asynchronous: bool
