@@ -19,10 +19,16 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from opentelemetry import context, metrics, trace
-from opentelemetry.context import Context
-from opentelemetry.metrics import CallbackOptions, Histogram, MeterProvider, Observation
-from opentelemetry.trace import Span, SpanKind, StatusCode, TracerProvider
+try:
+    from opentelemetry import context, metrics, trace
+    from opentelemetry.context import Context
+    from opentelemetry.metrics import CallbackOptions, Histogram, MeterProvider, Observation
+    from opentelemetry.trace import Span, SpanKind, StatusCode, TracerProvider
+except ImportError as error:
+    raise ImportError(
+        f"rosasync.opentelemetry needs the API of OpenTelemetry, which cannot be imported here "
+        f"({error}): pip install 'rosasync[opentelemetry]'"
+    ) from error
 
 if TYPE_CHECKING:
     from rosasync.session import Session

@@ -125,8 +125,8 @@ class Trace(Protocol):
         It is called in the context of the caller, or of the loop for a request taken.
 
         Returns:
-            For a request, the ``contextvars.Context`` in which its handler runs, if not None.
-            Each request needs a context of its own.
+            For a request, the ``contextvars.Context`` in a copy of which its handler runs. None for
+            the context of the loop.
         """
 
     def phase(self, call: TracedCall, phase: CallPhase, /) -> None:
@@ -189,7 +189,10 @@ class CallTrace:
         self._phase: Phase | None = None
         self._ended = False
         for hook in hooks:
-            self.context = self._notify(hook.start, call) or self.context
+            context = self._notify(hook.start, call)
+            if isinstance(context, Context):
+                # A copy, because a context can only be entered once at a time.
+                self.context = context.copy()
 
     def enter(self, phase: Phase, error: BaseException | None = None) -> None:
         """Begin a phase, unless the call is waiting or queued already, or has ended."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import subprocess
+import sys
 from collections.abc import AsyncIterator, Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +20,7 @@ from opentelemetry.trace import SpanKind, StatusCode
 from rosasync import ResponseTimeout, Retry, Session, UsageError
 from rosasync.opentelemetry import BUCKETS, OpenTelemetryTrace
 from tests.support.echo import ECHO
+from tests.support.process import ROOT
 from tests.support.serving import AnyCall, Holder, Response, ask, discard, echo_call, echo_of
 from tests.support.times import LIMIT, TICK, until
 
@@ -292,3 +295,15 @@ class TestMetrics:
     async def test_a_session_that_is_not_open(self, telemetry: Telemetry) -> None:
         with pytest.raises(UsageError):
             telemetry.trace.observe_pool(Session("unopened"), "mine")
+
+
+def test_without_opentelemetry_it_says_what_to_install() -> None:
+    program = (
+        "import sys; sys.modules['opentelemetry'] = None\n"
+        "try:\n    import rosasync.opentelemetry\n"
+        "except ImportError as error:\n    print(error)\n"
+    )
+    process = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    assert "pip install 'rosasync[opentelemetry]'" in process.stdout

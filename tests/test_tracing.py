@@ -460,6 +460,23 @@ async def test_a_hook_that_raises_disturbs_no_call(
     assert type(error).__name__ in caplog.text
 
 
+@pytest.mark.parametrize("result", [contextvars.copy_context(), True, object()])
+async def test_whatever_a_hook_returns_the_handler_runs(
+    session: Session, trace: Recorder, result: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def handler(call: AnyCall) -> Any:
+        await asyncio.sleep(TICK)
+        return echo_of(call.request)
+
+    monkeypatch.setattr(trace, "start", lambda call: Recorder.start(trace, call) or result)
+    async with Session("traced", bridge="executor", trace=trace) as traced:
+        traced.serve(ECHO, "/served", handler)
+        tasks = [ask(session, "/served", str(number), timeout=LIMIT) for number in range(3)]
+        assert await asyncio.gather(*tasks) == ["0", "1", "2"]
+        await trace.all_ended(3)
+    assert trace.of("server") == ["handling > answered"] * 3
+
+
 @pytest.mark.parametrize("wrong", [object(), Recorder, "trace", 1, CallEnd])
 def test_what_is_no_hook(wrong: Any) -> None:
     with pytest.raises(TypeError, match=r"rosasync\.Trace"):
