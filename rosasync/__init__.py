@@ -25,20 +25,25 @@ from rosasync.server import RequestInfo, ServiceCall, ServiceServer
 from rosasync.session import ServiceClient, Session
 from rosasync.statistics import (
     KeyStatistics,
+    LatencyStatistics,
     PoolStatistics,
     ServerStatistics,
     ServiceKey,
     SessionStatistics,
 )
+from rosasync.tracing import CallEnd, CallPhase, Trace, TracedCall
 from rosasync.typing import ServiceType
 
 __all__ = [
     "AsyncServiceProxy",
+    "CallEnd",
     "CallError",
+    "CallPhase",
     "ClientPool",
     "ContextShutdown",
     "InvalidServiceName",
     "KeyStatistics",
+    "LatencyStatistics",
     "LeasedClient",
     "Limits",
     "PoolFull",
@@ -61,6 +66,8 @@ __all__ = [
     "Session",
     "SessionClosed",
     "SessionStatistics",
+    "Trace",
+    "TracedCall",
     "UsageError",
     "to_dict",
     "to_message",

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from rosasync.client import Client
     from rosasync.ports import Servers
     from rosasync.retry import Attempts
+    from rosasync.tracing import CallTrace
 
 __all__ = ["Call"]
 
@@ -34,6 +35,7 @@ class Call:
             yet. `Client.learn_servers` sets them then.
         started: whether `start` was called.
         in_flight: whether it takes a place: it has started and not ended.
+        trace: follows the call, if something listens.
     """
 
     __slots__ = (
@@ -46,6 +48,7 @@ class Call:
         "request",
         "servers",
         "started",
+        "trace",
     )
 
     client: Client
@@ -58,10 +61,12 @@ class Call:
         request: Any,
         attempts: Attempts | None,
         leased: bool = False,
+        trace: CallTrace | None = None,
     ) -> None:
         self.future = future
         self.request = request
         self.attempts = attempts
+        self.trace = trace
         self.started = False
         self.in_flight = False
         self._leased = leased
@@ -87,6 +92,8 @@ class Call:
         self._sequence_number = sequence_number
         if sequence_number < TIMED or not sequence_number % TIMED:
             client.time_response(sequence_number)
+        if self.trace is not None:
+            self.trace.enter("sent")
         if self.attempts is not None:
             self.attempts.begin(self, client, sequence_number)
 
@@ -94,6 +101,8 @@ class Call:
         """Expect a response to another attempt as well."""
         self.servers = self.client.servers
         self.client.unanswered[sequence_number] = self
+        if self.trace is not None:
+            self.trace.enter("sent again")
 
     def lose_servers(self, error: Callable[[], Exception]) -> None:
         """Go to the next server if the call may be retried; otherwise set the error."""

@@ -6,7 +6,7 @@ import asyncio
 import logging
 import math
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from rosasync.client import Client, ClientOwner, Counts
 from rosasync.ports import PortDestroyed
@@ -17,12 +17,19 @@ if TYPE_CHECKING:
     from rosasync.options import Limits
     from rosasync.ports import NodePort, Servers, Service
 
-__all__ = ["ClientSet"]
+__all__ = ["ClientSet", "ClientSetOwner"]
 
 logger = logging.getLogger("rosasync")
 
 EVICT_MIN = 0.05
 """Minimum number of seconds between two checks for idle clients."""
+
+
+class ClientSetOwner(ClientOwner, Protocol):
+    """What the clients of a service report to it."""
+
+    def on_matched(self) -> None:
+        """React to a client that is matched with a server."""
 
 
 class ClientSet:
@@ -44,7 +51,7 @@ class ClientSet:
         limits: Limits,
         watch: GraphWatch,
         errors: CallErrors,
-        owner: ClientOwner,
+        owner: ClientSetOwner,
     ) -> None:
         self.counts = Counts()
         # What the graph showed when it last changed.
@@ -106,6 +113,15 @@ class ClientSet:
         )
 
     @property
+    def lacks_server(self) -> bool:
+        """Whether callers wait for a server, because no client is known to be matched."""
+        if not self._clients:
+            return True
+        generation = self._watch.generation
+        matched = any(client.matched_generation == generation for client in self._clients)
+        return not matched and self.awaits_match
+
+    @property
     def awaits_resend(self) -> bool:
         """Whether a request waits to be sent again."""
         return any(client.awaits_resend for client in self._clients)
@@ -145,7 +161,10 @@ class ClientSet:
             return True
         if not self._is_ready(client):
             return False
+        if client.matched_generation < 0:
+            logger.debug("%s: a client is matched with a server", self._service.key.srv_name)
         client.matched_generation = generation
+        self._owner.on_matched()
         self._warn_of_several_servers()
         if self._servers_generation != generation:
             # In a later turn, because the query takes 0.3 ms and the caller is about to send.
@@ -228,6 +247,7 @@ class ClientSet:
             self._owner,
         )
         self._clients.append(client)
+        logger.debug("%s: created client %d", self._service.key.srv_name, len(self._clients))
         self.share_queue()
         self.counts.created += 1
         self._growth_failed = False
@@ -240,7 +260,10 @@ class ClientSet:
 
         Call it after every change of the graph.
         """
-        self.servers = self._node.count_servers(self._service)
+        servers = self._node.count_servers(self._service)
+        if servers != self.servers:
+            logger.debug("%s: the graph shows %d servers", self._service.key.srv_name, servers)
+        self.servers = servers
         clients = self._node.count_clients(self._service)
         self.share = self._limits.share(clients)
         for client in self._clients:
@@ -262,6 +285,7 @@ class ClientSet:
         """Remove a client that other code has destroyed, for example by ``Node.destroy_client``."""
         if client in self._clients:
             self._clients.remove(client)
+            logger.debug("%s: a client was destroyed by other code", self._service.key.srv_name)
             client.fail(self._errors.client_destroyed)
             client.close()
             self._owner.on_capacity()
@@ -317,6 +341,12 @@ class ClientSet:
             if client.is_idle and client.idle_since + idle <= now and not self._owner.has_callers():
                 self._clients.remove(client)
                 client.close()
+                logger.debug(
+                    "%s: destroyed a client that was idle for %g s, %d left",
+                    self._service.key.srv_name,
+                    idle,
+                    len(self._clients),
+                )
         if self._clients:
             since = min(c.idle_since if c.is_idle else now for c in self._clients)
             self._evict_at(max(since + idle, now + EVICT_MIN))

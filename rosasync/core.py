@@ -21,6 +21,7 @@ from rosasync.gateway import LoopGateway
 from rosasync.pool import ClientPool
 from rosasync.portal import Portal
 from rosasync.server import ServiceServer
+from rosasync.tracing import Tracing
 
 if TYPE_CHECKING:
     from rosasync.options import SessionOptions
@@ -50,8 +51,14 @@ class Core:
         self.node = open_node(self.gateway, self._graph_changed, self._context_shut_down)
         self.name = self.node.name
         self.arguments = ArgumentChecker(self.node)
+        self.tracing = Tracing(options.trace)
         self.pool = ClientPool(
-            self.node, self.arguments, options.limits, options.timeout, self._context_shut_down
+            self.node,
+            self.arguments,
+            options.limits,
+            options.timeout,
+            self._context_shut_down,
+            self.tracing,
         )
         self.portal = Portal(self.node, self.gateway, self.arguments, self.pool, options.timeout)
         # A server removes itself when it ends, by its `on_end`.
@@ -87,7 +94,13 @@ class Core:
             raise session_closed()
         self.pool.check_open()
         server = ServiceServer[Any, Any](
-            self.node, srv_type, srv_name, handler, on_end=self.servers.pop, **options
+            self.node,
+            srv_type,
+            srv_name,
+            handler,
+            on_end=self.servers.pop,
+            tracing=self.tracing,
+            **options,
         )
         self.servers[server] = None
         return server

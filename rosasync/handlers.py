@@ -6,9 +6,11 @@ import asyncio
 import functools
 import inspect
 import logging
-from collections.abc import Awaitable, Callable, Coroutine
-from contextvars import ContextVar
+from collections.abc import Awaitable, Callable, Coroutine, Generator
+from contextvars import Context, ContextVar
 from dataclasses import dataclass
+from time import monotonic
+from types import CoroutineType
 from typing import Any, Generic, TypeAlias, TypeVar
 
 from rosasync.errors import ContextShutdown, SessionClosed
@@ -49,6 +51,9 @@ OverloadHook: TypeAlias = Callable[
 
 logger = logging.getLogger("rosasync")
 
+BLOCKING = 0.1
+"""Seconds for which a handler may block the loop unreported. asyncio's debug mode has the same."""
+
 _handler_task: ContextVar[asyncio.Task[Any] | None] = ContextVar("handler_task", default=None)
 """The task of the handler, or hook, in whose context the code runs. Tasks that a handler starts
 inherit it."""
@@ -71,9 +76,11 @@ class HandlerTasks:
     def __len__(self) -> int:
         return len(self._pending())
 
-    def spawn(self, work: Coroutine[Any, Any, None]) -> None:
-        """Run a coroutine in a task."""
-        task = self._loop.create_task(self._run(work))
+    def spawn(self, work: Coroutine[Any, Any, None], context: Context | None = None) -> None:
+        """Run a coroutine in a task, in a copy of this context, or of the current one."""
+        # Not with the argument `context`, because not every task factory takes it.
+        create = self._loop.create_task
+        task = create(self._run(work)) if context is None else context.run(create, self._run(work))
         if not task.done():
             self._tasks.add(task)
 
@@ -135,10 +142,12 @@ class HandlerKind(Generic[RequestT, ResponseT]):
     Attributes:
         invoke: calls the handler with the arguments that it takes.
         may_defer: whether it may return None, to respond later.
+        name: its name, for the log.
     """
 
     invoke: Callable[[ServiceCall[RequestT, ResponseT]], Any]
     may_defer: bool
+    name: str
 
 
 class HandlerRunner(Generic[RequestT, ResponseT]):
@@ -175,20 +184,25 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
         self._counts = counts
         self._tasks = tasks
         self._on_finished = on_finished
+        # Whether a handler has blocked the loop: it is reported once.
+        self._blocked = False
 
     def start(self, call: ServiceCall[RequestT, ResponseT]) -> None:
         """Run the handler: a plain one to its end, an async one in a task."""
-        assert self._kind is not None
+        trace = call.trace
+        if trace is not None:
+            trace.enter("handling")
+        context = None if trace is None else trace.context
         self.running += 1
         in_task = False
         try:
-            result = self._kind.invoke(call)
+            result = self._invoke(call, context)
             # The response first, because `isawaitable` is slow.
             if isinstance(result, self._sender.response_type) or not inspect.isawaitable(result):
                 self._finish(call, result)
             else:
                 in_task = True
-                self._tasks.spawn(self._await_handler(call, result))
+                self._tasks.spawn(self._await_handler(call, self._timed(result)), context)
         except BaseException as error:
             self._contain(call, error, self._fail)
         finally:
@@ -221,6 +235,23 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
             self._contain(call, error, self._fail_hook)
         if not call.settled:
             otherwise(call)
+
+    def _invoke(self, call: ServiceCall[RequestT, ResponseT], context: Context | None) -> Any:
+        """Call the handler, in a context if there is one, and report it if it blocks the loop."""
+        assert self._kind is not None
+        invoke = self._kind.invoke
+        began = monotonic()
+        try:
+            return invoke(call) if context is None else context.run(invoke, call)
+        finally:
+            if monotonic() - began > BLOCKING:
+                self._report_blocking(monotonic() - began)
+
+    def _timed(self, pending: Awaitable[Any]) -> Awaitable[Any]:
+        """Return what awaits a handler, and reports it if one of its steps blocks the loop."""
+        if type(pending) is CoroutineType and not self._blocked:
+            return _TimedSteps(pending, self._report_blocking)
+        return pending
 
     def _cancelled(self, call: ServiceCall[RequestT, ResponseT]) -> None:
         """Give up a call whose handler, or hook, was cancelled."""
@@ -265,6 +296,8 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
             )
         elif not call.settled:
             self._counts.deferred += 1
+            if call.trace is not None:
+                call.trace.enter("deferred")
 
     def _contain(
         self,
@@ -273,6 +306,8 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
         fail: Callable[[ServiceCall[RequestT, ResponseT], Exception], None],
     ) -> None:
         """Settle a call whose handler, or hook, has raised; pass on what ends the program."""
+        if call.trace is not None:
+            call.trace.fail(error)
         if isinstance(error, asyncio.CancelledError):
             self._cancelled(call)
         elif isinstance(error, Exception):
@@ -294,10 +329,61 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
     def _give_up(self, call: ServiceCall[RequestT, ResponseT]) -> None:
         call.give_up("given up: its handler failed", failed=True)
 
+    def _report_blocking(self, seconds: float) -> None:
+        if self._blocked or self._kind is None:
+            return
+        self._blocked = True
+        logger.warning(
+            "%s: the handler %s has blocked the event loop for %.0f ms, in which nothing else ran: "
+            "do slow work in `await asyncio.to_thread(…)`. This is reported once for each server",
+            self._sender.name,
+            self._kind.name,
+            seconds * 1000,
+        )
+
     def _fail_hook(self, call: ServiceCall[RequestT, ResponseT], error: Exception) -> None:
         logger.error(
             "%s: on_error or on_overload failed for %r", self._sender.name, call, exc_info=error
         )
+
+
+class _TimedSteps:
+    """Awaits a coroutine, and reports each of its steps that blocks the loop for too long.
+
+    A step is what runs from one suspension to the next, so the time that an ``await`` takes does
+    not count.
+    """
+
+    __slots__ = ("_coroutine", "_report")
+
+    def __init__(
+        self, coroutine: Coroutine[Any, Any, Any], report: Callable[[float], None]
+    ) -> None:
+        self._coroutine = coroutine
+        self._report = report
+
+    def __await__(self) -> Generator[Any, Any, Any]:
+        coroutine = self._coroutine
+        step: Callable[[Any], Any] = coroutine.send
+        value: Any = None
+        while True:
+            began = monotonic()
+            try:
+                awaited = step(value)
+            except StopIteration as end:
+                return end.value
+            finally:
+                value = None  # An exception would refer to this frame, and the frame to it.
+                if monotonic() - began > BLOCKING:
+                    self._report(monotonic() - began)
+            try:
+                value = yield awaited
+                step = coroutine.send
+            except GeneratorExit:
+                coroutine.close()
+                raise
+            except BaseException as error:
+                step, value = coroutine.throw, error
 
 
 def settle_kind(
@@ -323,11 +409,14 @@ def settle_kind(
         if inspect.isgeneratorfunction(function) or inspect.isasyncgenfunction(function):
             raise TypeError(f"a handler returns its response, it does not yield: {handler!r}")
     invoke: Callable[..., Any] = handler
+    name = getattr(code, "__qualname__", type(code).__qualname__)
     match _count_required(handler):
         case 1:
-            return HandlerKind(invoke, may_defer=True)
+            return HandlerKind(invoke, may_defer=True, name=name)
         case 2:
-            return HandlerKind(lambda call: invoke(call.request, call.response), may_defer=False)
+            return HandlerKind(
+                lambda call: invoke(call.request, call.response), may_defer=False, name=name
+            )
     raise TypeError(f"a handler takes (call) or (request, response): {handler!r} does not")
 
 

@@ -8,6 +8,7 @@ import operator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, SupportsFloat, SupportsIndex
 
+from rosasync.tracing import Trace, check_trace
 from rosasync.typing import Timeout
 
 if TYPE_CHECKING:
@@ -204,6 +205,7 @@ class SessionOptions:
     timeout: float | None
     busy_poll: float
     introspection: Literal["off", "metadata", "contents"]
+    trace: Trace | None = None
 
     def __post_init__(self) -> None:
         if self.bridge not in ("auto", "direct", "executor"):
@@ -216,6 +218,7 @@ class SessionOptions:
             raise TypeError(f"limits must be a rosasync.Limits, not {type(self.limits).__name__}")
         _set(self, "timeout", check_timeout(self.timeout, None))
         _set(self, "busy_poll", check_seconds("busy_poll", self.busy_poll))
+        check_trace(self.trace)
 
 
 def _set(frozen: object, name: str, value: object) -> None:

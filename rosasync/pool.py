@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Generic, overload
 from rosasync.aio import Deadlines
 from rosasync.errors import UsageError
 from rosasync.graph_watch import GraphWatch
+from rosasync.latency import summarize
 from rosasync.options import check_count, check_timeout
 from rosasync.service_pool import MATCH_TIMEOUT, ServicePool
 from rosasync.statistics import KeyStatistics, PoolStatistics, ServiceKey
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from rosasync.client import Client
     from rosasync.options import Limits, Retry
     from rosasync.ports import NodePort, Service
+    from rosasync.tracing import Tracing
     from rosasync.typing import ServiceType, Timeout
 
 __all__ = ["ClientPool", "LeasedClient"]
@@ -42,12 +44,14 @@ class ClientPool:
         limits: Limits,
         timeout: float | None,
         on_shutdown: Callable[[], object],
+        tracing: Tracing,
     ) -> None:
         self._loop = asyncio.get_running_loop()
         self._node = node
         self._arguments = arguments
         self._limits = limits
         self._timeout = timeout
+        self._tracing = tracing
         self._opened = self._loop.time()
         self._services: dict[ServiceKey, ServicePool] = {}
         # Repeated calls find their service here by the type and name as given, unresolved.
@@ -145,9 +149,10 @@ class ClientPool:
     def statistics(self) -> PoolStatistics:
         """Take a snapshot of the pool, in total and for each service."""
         keys = {key: service.statistics() for key, service in self._services.items()}
-        names = KeyStatistics.__dataclass_fields__
+        names = [name for name in KeyStatistics.__dataclass_fields__ if name != "latency"]
         total = {name: sum(getattr(s, name) for s in keys.values()) for name in names}
-        return PoolStatistics(**total, keys=keys)
+        latency = summarize(service.latencies for service in self._services.values())
+        return PoolStatistics(**total, latency=latency, keys=keys)
 
     # For the session.
 
@@ -179,7 +184,9 @@ class ClientPool:
         self.check_open()
         pool = self._services.get(service.key)
         if pool is None:
-            pool = ServicePool(service, self._node, self._limits, self._watch, self._deadlines)
+            pool = ServicePool(
+                service, self._node, self._limits, self._watch, self._deadlines, self._tracing
+            )
             self._services[service.key] = pool
         return pool
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import contextvars
 import threading
 import time
 from collections.abc import Mapping
@@ -220,6 +221,8 @@ class _Submission(Future[Any]):
         self._wait = wait
         self._retry = retry
         self._submitted = time.monotonic()
+        # The call runs in the context of its caller, for a trace.
+        self._context = contextvars.copy_context()
         self._task: asyncio.Task[None] | None = None
 
     def submit(self) -> None:
@@ -298,7 +301,7 @@ class _Submission(Future[Any]):
 
     def _start(self) -> None:
         if not self.done():
-            self._task = self._gateway.loop.create_task(self._call())
+            self._task = self._context.run(self._gateway.loop.create_task, self._call())
 
     def _cancel(self) -> None:
         if self._task is not None:

@@ -11,6 +11,7 @@ import math
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
+from time import monotonic_ns
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Generic, NamedTuple, Self
 
@@ -35,10 +36,12 @@ from rosasync.service_call import (
 )
 from rosasync.sizes import payload_size
 from rosasync.statistics import ServerStatistics
+from rosasync.tracing import ServerTracing
 from rosasync.typing import RequestT, ResponseT
 
 if TYPE_CHECKING:
     from rosasync.ports import NodePort, RequestHeader
+    from rosasync.tracing import Tracing
 
 __all__ = ["Handler", "RequestInfo", "ServiceCall", "ServiceServer"]
 
@@ -81,6 +84,7 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         on_error: ErrorHook[RequestT, ResponseT] | None,
         on_overload: OverloadHook[RequestT, ResponseT] | None,
         on_end: Callable[[ServiceServer[RequestT, ResponseT]], object],
+        tracing: Tracing,
     ) -> None:
         self._loop = asyncio.get_running_loop()
         kind = settle_kind(handler)
@@ -103,6 +107,8 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         self._overload_logged = False
         service = node.describe(srv_type, srv_name, qos)
         self._name, self._type_name, _ = service.key
+        self._tracing = tracing
+        self._traces = ServerTracing(tracing, service.key)
         self._port = node.open_service(service, self._on_request)
         self._qos = self._port.qos
         self._sender = ResponseSender[ResponseT](
@@ -151,6 +157,8 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         call = await self._queue.get()
         self._overload_logged = False
         if call is not None:
+            if call.trace is not None:
+                call.trace.enter("handling")
             return call
         ending = self._sender.ending
         if ending is not None and not isinstance(error := ending(), SessionClosed):
@@ -262,6 +270,7 @@ class ServiceServer(Generic[RequestT, ResponseT]):
             self._stop_taking()
             self._drop_waiting()
             self._sender.close(ending)
+            self._traces.close()
             self._port.close()
             if not self._loop.is_closed():
                 self._tasks.cancel()
@@ -277,10 +286,14 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         if not self._taking:
             return
         self._counts.taken += 1
-        call = ServiceCall(self, request, header, self._sender)
+        now = monotonic_ns()
+        trace = self._traces.start(now) if now >= self._tracing.quiet_until else None
+        call = ServiceCall(self, request, header, self._sender, now, trace)
         if self._has_handler and not self._queue and self._runner.running < self._concurrency:
             self._runner.start(call)
         elif self._queue.put(call):
+            if trace is not None:
+                trace.enter("queued")
             if self._has_handler:
                 self._start_waiting()
         else:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Coroutine
 from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass
-from time import monotonic
+from time import monotonic, monotonic_ns
 from typing import TYPE_CHECKING, Any, Generic
 
 from rosasync.errors import ContextShutdown, UsageError
@@ -21,6 +21,7 @@ from rosasync.typing import RequestT, ResponseT
 if TYPE_CHECKING:
     from rosasync.ports import RequestHeader, ServicePort
     from rosasync.server import ServiceServer
+    from rosasync.tracing import ServerTrace
 
 __all__ = ["CallCounts", "RequestInfo", "ResponseSender", "ServiceCall", "service_destroyed"]
 
@@ -36,8 +37,8 @@ DELIVERY_TIME = 0.5
 of lost packets take several of the middleware's heartbeats (20 ms, or 3 s by its own default)."""
 DELIVERY_INTERVAL = 0.01
 """Seconds between two queries whether the last responses were received."""
-LATE = 0.1
-"""Seconds after which the graph is checked for a client, because it may have left."""
+LATE = 100_000_000
+"""Nanoseconds after which the graph is checked for a client, because it may have left."""
 
 _ANSWERED = "answered"
 
@@ -77,6 +78,7 @@ class ServiceCall(Generic[RequestT, ResponseT]):
         "_sender",
         "request",
         "server",
+        "trace",
     )
 
     def __init__(
@@ -85,6 +87,8 @@ class ServiceCall(Generic[RequestT, ResponseT]):
         request: RequestT,
         header: RequestHeader,
         sender: ResponseSender[ResponseT],
+        received: int,
+        trace: ServerTrace | None,
     ) -> None:
         self.server = server
         self.request = request
@@ -93,14 +97,16 @@ class ServiceCall(Generic[RequestT, ResponseT]):
         self._response: ResponseT | None = None
         # None until the call is settled; changed under the sender's lock.
         self._outcome: str | None = None
-        self._received = monotonic()
+        self._received = received
+        # For the server and its sender, which report what happens to the call.
+        self.trace = trace
 
     def __repr__(self) -> str:
         number = self._header.request_id.sequence_number
         return f"<ServiceCall {self._sender.name} #{number} {self._outcome or 'unanswered'}>"
 
     def __del__(self) -> None:
-        if self._outcome is None and self._sender.count_collected():
+        if self._outcome is None and self._sender.count_collected(self.trace):
             warnings.warn(
                 f"{self._sender.name}: a call was dropped unanswered",
                 ResourceWarning,
@@ -155,7 +161,7 @@ class ServiceCall(Generic[RequestT, ResponseT]):
             sender.begin(self._outcome)
             self._outcome = _ANSWERED
         try:
-            late = monotonic() - self._received > LATE
+            late = monotonic_ns() - self._received > LATE
             sender.send(self, self._header, response, late=late)
         except BaseException:
             self._outcome = None
@@ -177,6 +183,8 @@ class ServiceCall(Generic[RequestT, ResponseT]):
                 return False
             self._outcome = reason
             sender.count_unanswered(failed=failed)
+        if self.trace is not None:
+            self.trace.end_unanswered()
         return True
 
 
@@ -266,11 +274,18 @@ class ResponseSender(Generic[ResponseT]):
             raise UsageError(f"{self.name}: this call was {outcome}")
         self._sending += 1
 
-    def send(self, call: object, header: RequestHeader, response: ResponseT, *, late: bool) -> None:
+    def send(
+        self,
+        call: ServiceCall[Any, ResponseT],
+        header: RequestHeader,
+        response: ResponseT,
+        *,
+        late: bool,
+    ) -> None:
         """Send the response of a call, or have it sent again later. Call `begin` first.
 
         Args:
-            call: the call, for the log.
+            call: the call.
             header: the header of its request.
             response: the response.
             late: whether the client may have left since it sent the request.
@@ -289,7 +304,9 @@ class ResponseSender(Generic[ResponseT]):
         except RuntimeError:
             self.give_up(call, "the event loop is closed")
 
-    def send_again(self, call: object, header: RequestHeader, response: ResponseT) -> bool:
+    def send_again(
+        self, call: ServiceCall[Any, ResponseT], header: RequestHeader, response: ResponseT
+    ) -> bool:
         """Send a response that could not be sent before.
 
         Returns:
@@ -302,11 +319,13 @@ class ResponseSender(Generic[ResponseT]):
             self.begin()
         return self._try(call, header, response, late=True)
 
-    def give_up(self, call: object, reason: object) -> None:
+    def give_up(self, call: ServiceCall[Any, ResponseT], reason: object) -> None:
         """Count and log a response that cannot be delivered."""
         with self.lock:
             self._counts.undeliverable += 1
         logger.warning("%s: the response of %r cannot be delivered: %s", self.name, call, reason)
+        if call.trace is not None:
+            call.trace.end("undeliverable")
 
     def count_unanswered(self, *, failed: bool) -> None:
         """Count a call that was given up. Call it under the lock."""
@@ -315,8 +334,11 @@ class ResponseSender(Generic[ResponseT]):
         else:
             self._counts.dropped += 1
 
-    def count_collected(self) -> bool:
+    def count_collected(self, trace: ServerTrace | None) -> bool:
         """Count a call that was garbage-collected unanswered, in a later turn of the loop.
+
+        Args:
+            trace: the trace of the call.
 
         Returns:
             False if the server or the loop has ended, so that there is nothing to warn of.
@@ -325,7 +347,7 @@ class ResponseSender(Generic[ResponseT]):
         if self.ending is not None:
             return False
         try:
-            self._loop.call_soon_threadsafe(self._count_dropped)
+            self._loop.call_soon_threadsafe(self._count_dropped, trace)
         except RuntimeError:
             return False
         return True
@@ -364,19 +386,30 @@ class ResponseSender(Generic[ResponseT]):
         """Return whether a client may not have received the last responses yet."""
         return self._port.has_clients() and not self._port.delivered()
 
-    def _count_dropped(self) -> None:
+    def _count_dropped(self, trace: ServerTrace | None) -> None:
         with self.lock:
             # Otherwise `close` has counted the call.
             if self.ending is None:
                 self._counts.dropped += 1
+        if trace is not None:
+            trace.end_unanswered()
 
-    def _try(self, call: object, header: RequestHeader, response: ResponseT, late: bool) -> bool:
+    def _try(
+        self,
+        call: ServiceCall[Any, ResponseT],
+        header: RequestHeader,
+        response: ResponseT,
+        late: bool,
+    ) -> bool:
         sent = False
         try:
             self._port.send(header, response)
             if late and not self._port.has_clients():
                 raise Undeliverable("the service has no client any more")
             sent = True
+            # Before `_sending` is counted down, so that `close` finds the trace ended.
+            if call.trace is not None:
+                call.trace.end("answered")
         except Unmatched:
             return False
         except Undeliverable as error:
@@ -403,7 +436,7 @@ class ResponseSender(Generic[ResponseT]):
 class _Unsent:
     """A response that its client could not get yet."""
 
-    call: object
+    call: ServiceCall[Any, Any]
     header: RequestHeader
     response: Any
     attempts: int = 0

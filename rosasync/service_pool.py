@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 import math
 from collections import OrderedDict
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import asdict
+from time import monotonic_ns
 from typing import TYPE_CHECKING, Any
 
 from rosasync.aio import Deadlines, Expired
@@ -17,6 +17,7 @@ from rosasync.call_errors import CallErrors
 from rosasync.client import Client
 from rosasync.client_set import ClientSet
 from rosasync.errors import ContextShutdown, RosasyncError
+from rosasync.latency import LatencyHistogram, summarize
 from rosasync.ports import PortDestroyed
 from rosasync.retry import Attempts, RetryBudget
 from rosasync.statistics import KeyStatistics
@@ -25,10 +26,9 @@ if TYPE_CHECKING:
     from rosasync.graph_watch import GraphWatch
     from rosasync.options import Limits, Retry
     from rosasync.ports import NodePort, Service
+    from rosasync.tracing import CallTrace, Outcome, Tracing
 
 __all__ = ["MATCH_TIMEOUT", "ServicePool"]
-
-logger = logging.getLogger("rosasync")
 
 OnClient = Callable[[Client], None]
 """Called with the client when one is granted."""
@@ -57,12 +57,15 @@ class ServicePool:
         limits: Limits,
         watch: GraphWatch,
         deadlines: Deadlines,
+        tracing: Tracing,
     ) -> None:
         self.service = service
+        self.latencies = LatencyHistogram()
         self._node = node
         self._limits = limits
         self._watch = watch
         self._deadlines = deadlines
+        self._tracing = tracing
         self._loop = asyncio.get_running_loop()
         self._errors = CallErrors(service, node)
         self._clients = ClientSet(service, node, limits, watch, self._errors, self)
@@ -71,6 +74,8 @@ class ServicePool:
         self._queue: OrderedDict[asyncio.Future[Any], OnClient] = OrderedDict()
         # Each caller who waits for a match, with the client to be matched: None for any client.
         self._ready_waiters: dict[asyncio.Future[None], Client | None] = {}
+        # The traced calls that wait for a server.
+        self._unmatched: dict[CallTrace, None] = {}
         self._dispatch_scheduled = False
         # Started when the last server has vanished; ends the requests after GONE_DELAY.
         self._gone_timer: asyncio.TimerHandle | None = None
@@ -117,6 +122,7 @@ class ServicePool:
             window=self._clients.window,
             share=self._clients.share,
             servers=self._clients.servers,
+            latency=summarize([self.latencies]),
             **counts,
         )
 
@@ -146,14 +152,18 @@ class ServicePool:
             Exception: as `Session.call`.
         """
         loop = self._loop
+        now = monotonic_ns()
+        trace = None
+        if now >= self._tracing.quiet_until:
+            trace = self._tracing.start(self.service.key, now)
         started = loop.time()
         deadline = None if timeout is None else started + timeout
         attempts = None if retry is None else Attempts(retry, self._budget)
-        call = Call(loop.create_future(), request, attempts, leased is not None)
+        call = Call(loop.create_future(), request, attempts, leased is not None, trace)
         entry = None
         try:
             if leased is not None:
-                await self._wait_until_ready(leased, deadline)
+                await self._wait_until_ready(leased, deadline, trace)
                 call.start(leased)
             else:
                 client = None if self._queue else self._clients.lease()
@@ -162,6 +172,8 @@ class ServicePool:
                 if client is not None:
                     call.start(client)
                 else:
+                    if trace is not None:
+                        self._trace_wait(trace, self._clients.lacks_server)
                     if not wait:
                         await self._check_server(started, deadline)
                     self._enqueue(call.future, call.start)
@@ -178,6 +190,9 @@ class ServicePool:
             elif not call.started:
                 self._queue.pop(call.future, None)
         self._counts.completed += 1
+        self.latencies.add(monotonic_ns() - now)
+        if trace is not None:
+            self._end_trace(trace, "answered")
         return response
 
     async def lease(self, timeout: float | None) -> Client:
@@ -279,6 +294,12 @@ class ServicePool:
             self._gone_timer = self._loop.call_later(GONE_DELAY, self._end_requests)
 
     # For the clients.
+
+    def on_matched(self) -> None:
+        """Report to the traced calls that a client is matched: from now on they are queued."""
+        waiting, self._unmatched = self._unmatched, {}
+        for trace in waiting:
+            trace.enter("queued")
 
     def on_capacity(self) -> None:
         """Schedule a dispatch if callers wait."""
@@ -383,7 +404,9 @@ class ServicePool:
             raise self._errors.client_destroyed()
         return leased.capacity >= 0 and self._clients.is_matched(leased)
 
-    async def _wait_until_ready(self, leased: Client | None, deadline: float | None) -> None:
+    async def _wait_until_ready(
+        self, leased: Client | None, deadline: float | None, trace: CallTrace | None = None
+    ) -> None:
         """Wait until any client is matched, or until the leased one is matched and has its place.
 
         Raises:
@@ -394,6 +417,9 @@ class ServicePool:
         while not self._is_ready_for(leased):
             waiter: asyncio.Future[None] = self._loop.create_future()
             self._ready_waiters[waiter] = leased
+            if trace is not None and leased is not None:
+                matched = leased.matched_generation == self._watch.generation
+                self._trace_wait(trace, not matched)
             self._watch.poll_soon()
             self._clients.request_place()
             try:
@@ -425,6 +451,19 @@ class ServicePool:
         left = math.inf if deadline is None else max(0.0, deadline - now)
         await self.wait_for_server(min(MATCH_TIMEOUT, left))
 
+    # Tracing.
+
+    def _trace_wait(self, trace: CallTrace, for_server: bool) -> None:
+        if for_server:
+            self._unmatched[trace] = None
+        trace.enter("waiting" if for_server else "queued")
+
+    def _end_trace(
+        self, trace: CallTrace, outcome: Outcome, error: BaseException | None = None
+    ) -> None:
+        self._unmatched.pop(trace, None)
+        trace.end(outcome, error)
+
     # Failures.
 
     def _end_requests(self) -> None:
@@ -449,16 +488,20 @@ class ServicePool:
         except Exception as failure:
             # The node went down before the graph could be asked.
             error = failure
+        outcome: Outcome
         if isinstance(error, asyncio.CancelledError):
+            outcome = "cancelled"
             counts.cancelled += 1
             if call.started and not call.future.cancelled() and call.future.exception() is None:
                 counts.late += 1  # The response came before the cancelled task resumed.
         elif isinstance(error, TimeoutError):
+            outcome = "timed out"
             counts.timed_out += 1
-            logger.debug("%s", error)
         else:
+            outcome = "failed"
             counts.failed += 1
-            logger.debug("%s: %r", self.service.key.srv_name, error)
+        if call.trace is not None:
+            self._end_trace(call.trace, outcome, error)
         return error
 
     def _translate(self, call: Call, error: BaseException, started: float) -> BaseException:

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from rosasync.ros.node import RosNode
     from rosasync.server import ServiceServer
     from rosasync.service_pool import ServicePool
+    from rosasync.tracing import Trace
 
 __all__ = ["ServiceClient", "Session"]
 
@@ -63,6 +64,8 @@ class Session:
         introspection: what clients and servers publish about each call, on
             ``<service>/_service_event``: ``"off"``, ``"metadata"`` (that it happened) or
             ``"contents"`` (with request and response).
+        trace: a `Trace`, which is called for the start, each phase and the end of every call made
+            and every request taken, such as ``rosasync.opentelemetry.OpenTelemetryTrace``.
 
     Raises:
         TypeError, ValueError: an argument is of the wrong type, or out of range.
@@ -79,6 +82,7 @@ class Session:
         timeout: float | None = 10.0,
         busy_poll: float = 0.0,
         introspection: Literal["off", "metadata", "contents"] = "off",
+        trace: Trace | None = None,
     ) -> None:
         self._options = SessionOptions(
             node=node,
@@ -89,6 +93,7 @@ class Session:
             timeout=timeout,
             busy_poll=busy_poll,
             introspection=introspection,
+            trace=trace,
         )
         self._core: Core | None = None
         # Whether it was closed before it was opened. Once it is open, `Core.closed` counts.
