@@ -231,7 +231,8 @@ class Session:
             timeout: seconds for the whole call, None for no deadline; if left out, the session's.
             qos: a ``QoSProfile``; None for the service default with a history of 1,000, or of
                 ``Limits.in_flight``, at least 10, without rosasync's Fast DDS profile.
-            wait: False to fail at once if there is no server.
+            wait: False to fail at once if there is no server, or none of this type. A call that
+                waits while the name is served as another type logs a warning after one second.
             retry: when to send an unanswered request again; only for services that may run twice.
 
         Raises:

@@ -168,6 +168,10 @@ class RosNode:
         """Describe what the graph shows instead of this service, as a clause."""
         return self._graph.explain_missing(service)
 
+    def explain_mismatch(self, service: Service) -> str | None:
+        """Describe the servers of the name as a clause, if all of them have another type."""
+        return self._graph.explain_mismatch(service)
+
     def stop(self) -> None:
         """Ask the executor thread to end. From any thread; idempotent; takes no lock.
 
