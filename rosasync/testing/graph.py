@@ -250,6 +250,9 @@ class FakeSession(Session):
         super().__init__("fake", **options)
         self._graph = graph
 
+    async def _load(self) -> None:
+        """Import nothing: a graph in memory needs no rclpy."""
+
     def _open_node(
         self, gateway: LoopGateway, on_graph: Callable[[], None], on_shutdown: Callable[[], None]
     ) -> FakeNode:
