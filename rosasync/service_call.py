@@ -102,7 +102,8 @@ class ServiceCall(Generic[RequestT, ResponseT]):
     def __del__(self) -> None:
         if self._outcome is None and self._sender.count_collected():
             warnings.warn(
-                f"{self._sender.name}: a call was dropped unanswered",
+                f"{self._sender.name}: a call was dropped unanswered, so its client waits in vain: "
+                "keep the call, and call its respond() once",
                 ResourceWarning,
                 source=self,
                 stacklevel=2,
@@ -306,7 +307,7 @@ class ResponseSender(Generic[ResponseT]):
         """Count and log a response that cannot be delivered."""
         with self.lock:
             self._counts.undeliverable += 1
-        logger.warning("%s: the response of %r cannot be delivered: %s", self.name, call, reason)
+        logger.warning("%s: the response to %r cannot be delivered: %s", self.name, call, reason)
 
     def count_unanswered(self, *, failed: bool) -> None:
         """Count a call that was given up. Call it under the lock."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable, Coroutine
 from typing import Any
 
 import py_trees
@@ -20,7 +20,7 @@ from tests.support.echo import ECHO, service_class
 from tests.support.times import LIMIT, TICK, until
 
 ABSENT, SILENT = "/absent", "/silent"
-Way = Callable[..., Awaitable[object]]
+Way = Callable[..., Coroutine[Any, Any, None]]
 
 
 async def session_call(session: Session, **options: Any) -> None:
@@ -194,7 +194,7 @@ async def test_the_sessions_timeout_holds(
 )
 async def test_there_is_no_deadline(graph: FakeGraph, way: Way, options: dict[str, Any]) -> None:
     async with graph.session(timeout=TICK) as session:
-        task = asyncio.create_task(way(session, **options))  # type: ignore[arg-type]
+        task = asyncio.create_task(way(session, **options))
         reference = session.start(ECHO, ABSENT)
         await until(reference.done)
         await asyncio.sleep(2 * TICK)
@@ -207,7 +207,7 @@ async def test_there_is_no_deadline(graph: FakeGraph, way: Way, options: dict[st
 @pytest.mark.parametrize("way", CALLS)
 async def test_a_session_without_a_timeout_has_none(graph: FakeGraph, way: Way) -> None:
     async with graph.session(timeout=None) as session:
-        task = asyncio.create_task(way(session))  # type: ignore[arg-type]
+        task = asyncio.create_task(way(session))
         await asyncio.sleep(2 * TICK)
         assert not task.done()
         task.cancel()
