@@ -26,9 +26,12 @@ if TYPE_CHECKING:
     from rosasync.options import Limits, Retry
     from rosasync.ports import NodePort, Service
 
-__all__ = ["MATCH_TIMEOUT", "ServicePool"]
+__all__ = ["MATCH_TIMEOUT", "MISMATCH_LOGGER", "ServicePool"]
 
 logger = logging.getLogger("rosasync")
+
+MISMATCH_LOGGER = "rosasync.mismatch"
+"""The logger of the warning about servers of another type, so that it can be silenced alone."""
 
 OnClient = Callable[[Client], None]
 """Called with the client when one is granted."""
@@ -450,7 +453,7 @@ class ServicePool:
     def _warn_of_mismatch(self) -> None:
         mismatch = self._node.explain_mismatch(self.service)
         if mismatch is not None and mismatch != self._mismatch:
-            logger.warning(
+            logging.getLogger(MISMATCH_LOGGER).warning(
                 "%s: callers wait for a server of type %s, but %s: call it with the server's type, "
                 "or stop that server",
                 *self.service.key[:2],
