@@ -1,17 +1,21 @@
-"""Additions to asyncio: shared deadlines, tasks that start at once, uncancellable waits."""
+"""Additions to asyncio: shared deadlines, tasks that start at once, waits that end in any case."""
 
 from __future__ import annotations
 
 import asyncio
 import itertools
 import math
-from collections.abc import Coroutine, Generator
+import threading
+from collections.abc import Callable, Coroutine, Generator
+from concurrent.futures import Future
+from contextlib import suppress
 from heapq import heapify, heappop, heappush
 from typing import Any, TypeVar
 
 import anyio
+from anyio.lowlevel import checkpoint_if_cancelled
 
-__all__ = ["Deadlines", "Expired", "start_task", "until_done"]
+__all__ = ["Deadlines", "Expired", "call_in_thread", "start_task", "until_done"]
 
 T = TypeVar("T")
 
@@ -144,8 +148,8 @@ class _Started(Coroutine[Any, Any, T]):
         raise RuntimeError("a started coroutine runs as a task, it cannot be awaited")
 
 
-async def until_done(task: asyncio.Task[None]) -> None:
-    """Wait until a task has ended, and only then raise a cancellation of the caller.
+async def until_done(task: asyncio.Future[None]) -> None:
+    """Wait until a task or future is done, and only then raise a cancellation of the caller.
 
     Raises:
         Exception: the task raised it.
@@ -161,3 +165,39 @@ async def until_done(task: asyncio.Task[None]) -> None:
     if cancelled is not None:
         raise cancelled
     task.result()
+
+
+async def call_in_thread(function: Callable[[], T], name: str) -> T:
+    """Call a function in a thread of its own, which has ended when this returns or raises.
+
+    The threads of ``asyncio.to_thread`` stay until the loop ends, and may all be busy. A
+    cancellation is raised when the function has returned, and its result is dropped.
+
+    Args:
+        function: the function. Its exceptions are raised here.
+        name: the name of the thread.
+    """
+    loop = asyncio.get_running_loop()
+    ended: asyncio.Future[None] = loop.create_future()
+    outcome: Future[T] = Future()
+
+    def run() -> None:
+        try:
+            outcome.set_result(function())
+        except BaseException as error:
+            outcome.set_exception(error)
+        # The loop may have been closed in the meantime.
+        with suppress(RuntimeError):
+            loop.call_soon_threadsafe(ended.set_result, None)
+
+    thread = threading.Thread(target=run, name=name)
+    thread.start()
+    try:
+        await until_done(ended)
+    finally:
+        # If the loop ends without waiting for its tasks, neither does this.
+        if ended.done():
+            thread.join()
+    # A cancelled scope of anyio was held off by the shield.
+    await checkpoint_if_cancelled()
+    return outcome.result()

@@ -69,7 +69,10 @@ class ServiceBehaviour(Behaviour, Generic[RequestT, ResponseT]):  # type: ignore
         """
         session = self._session or kwargs.get("session")
         if session is None:
-            raise KeyError(f"{self.qualified_name}: no 'session' in setup's keyword arguments")
+            raise KeyError(
+                f"{self.qualified_name} has no session: call tree.setup(session=session), or give "
+                "it session="
+            )
         self.shutdown()
         self._proxy = AsyncServiceProxy(session, self.srv_type, self.srv_name, qos=self._qos)
 

@@ -38,7 +38,8 @@ class CallErrors:
         """Return the error for a call that found a server, but no free client."""
         message = (
             f"no client became free within {elapsed:.3g} s: {in_flight} requests are in flight, "
-            f"and {abandoned} abandoned requests (cancelled or timed out) still count"
+            f"and {abandoned} abandoned requests (cancelled or timed out) still count; the server "
+            "is slower than its callers"
         )
         return self._make(QueueTimeout, message, elapsed)
 
@@ -64,7 +65,7 @@ class CallErrors:
         """Return the error for a call that finds the queue full."""
         return PoolFull(
             f"{self._service.key.srv_name}: {waiting} callers already wait for a client, and "
-            f"Limits.waiting={limit} allows no more"
+            f"Limits.waiting={limit} allows no more: the server is slower than its callers"
         )
 
     def _make(self, kind: type[CallError], message: str, elapsed: float) -> CallError:

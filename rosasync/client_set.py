@@ -232,7 +232,7 @@ class ClientSet:
             if not self._growth_failed:
                 self._growth_failed = True
                 logger.warning(
-                    "%s: no further client can be created, so all calls share %d: %s",
+                    "%s: no further client can be created, so the calls share %d: %s",
                     self._service.key.srv_name,
                     len(self._clients),
                     error,
@@ -324,8 +324,8 @@ class ClientSet:
         self._servers_counted = counted
         if (servers := len(self._node.find_servers(self._service))) > 1:
             logger.warning(
-                "%s: %d servers answer this name; the first response wins, and the others are "
-                "dropped",
+                "%s: %d servers answer this name. Each runs every request, and all responses "
+                "but the first are dropped: stop all but one",
                 self._service.key.srv_name,
                 servers,
             )

@@ -176,8 +176,10 @@ class Core:
                 self.node.close()
             else:
                 logger.warning(
-                    "a callback of node %s still runs: its executor thread is left behind",
+                    "a callback of node %s still runs after %g s, so the executor thread is left "
+                    "behind: find a callback of the node that blocks",
                     self.name,
+                    END_TIMEOUT,
                 )
             # Last: if a second Ctrl-C interrupts the end, the interpreter's exit completes it.
             atexit.unregister(self._exit)
@@ -198,7 +200,7 @@ class Core:
 
 def session_closed() -> SessionClosed:
     """Make the error for a session that has been closed."""
-    return SessionClosed("the session is closed")
+    return SessionClosed("the session is closed: open a new one")
 
 
 def _warn_unclosed(session: object) -> None:

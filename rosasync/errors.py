@@ -50,7 +50,8 @@ class ContextShutdown(RosasyncError):
     """The rclpy context was shut down, or the session's node destroyed."""
 
     def __init__(
-        self, message: str = "the rclpy context was shut down, or the node destroyed"
+        self,
+        message: str = "the rclpy context was shut down, or the node destroyed: open a new session",
     ) -> None:
         super().__init__(message)
 

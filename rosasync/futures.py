@@ -33,7 +33,7 @@ def wrap_future(future: Any) -> asyncio.Future[Any]:
     try:
         loop = asyncio.get_running_loop()
     except RuntimeError:
-        raise UsageError("wrap_future needs a running event loop") from None
+        raise UsageError("wrap_future needs a running event loop: call it in a coroutine") from None
     wrapped: asyncio.Future[Any] = loop.create_future()
 
     def arrive() -> None:

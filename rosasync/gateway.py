@@ -61,7 +61,7 @@ class LoopGateway:
     def check_open(self) -> None:
         """Raise `SessionClosed` if the gateway, or the loop, is closed."""
         if self.closed:
-            raise SessionClosed("the session is closed")
+            raise SessionClosed("the session is closed: open a new one")
 
     def post(self, callback: Callable[..., object], *args: Any) -> None:
         """Call ``callback(*args)`` on the loop's thread, in a later turn.
@@ -107,7 +107,7 @@ class LoopGateway:
             self._closed = True
             self._calls = []
         for operation in tuple(self._pending):
-            operation.fail(SessionClosed("the session is closed"))
+            operation.fail(SessionClosed("the session is closed: open a new one"))
         self._pending.clear()
 
     def _drain(self) -> None:

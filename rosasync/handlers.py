@@ -257,7 +257,11 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
         """Give up a call whose handler, or hook, was cancelled."""
         call.give_up("given up: its handler was cancelled")
         if not call.responded:
-            logger.warning("%s: the handler of %r was cancelled", self._sender.name, call)
+            logger.warning(
+                "%s: the handler of %r was cancelled, so its client gets no response",
+                self._sender.name,
+                call,
+            )
 
     async def _await_handler(
         self, call: ServiceCall[RequestT, ResponseT], pending: Awaitable[Any]
@@ -317,10 +321,20 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
 
     def _fail(self, call: ServiceCall[RequestT, ResponseT], error: Exception) -> None:
         if self._sender.ending is not None and isinstance(error, SessionClosed | ContextShutdown):
-            logger.warning("%s: the handler of %r outlasted the server", self._sender.name, call)
+            logger.warning(
+                "%s: the handler of %r outlasted the server, so its client gets no response",
+                self._sender.name,
+                call,
+            )
             return
         self._counts.failed += 1
-        logger.error("%s: the handler of %r failed", self._sender.name, call, exc_info=error)
+        logger.error(
+            "%s: the handler of %r raised an exception%s",
+            self._sender.name,
+            call,
+            "" if self._on_error or call.settled else ", so its client gets no response",
+            exc_info=error,
+        )
         if self._on_error is None or call.settled:
             self._give_up(call)
         else:
@@ -343,7 +357,10 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
 
     def _fail_hook(self, call: ServiceCall[RequestT, ResponseT], error: Exception) -> None:
         logger.error(
-            "%s: on_error or on_overload failed for %r", self._sender.name, call, exc_info=error
+            "%s: on_error or on_overload raised an exception for %r",
+            self._sender.name,
+            call,
+            exc_info=error,
         )
 
 

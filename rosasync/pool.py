@@ -139,7 +139,8 @@ class ClientPool:
         clients = check_count("clients", clients, 1)
         if clients > self._limits.clients:
             raise ValueError(
-                f"clients={clients} is more than Limits.clients={self._limits.clients}"
+                f"clients={clients} is more than Limits.clients={self._limits.clients}: raise the "
+                "limit of the session, Session(limits=Limits(clients=…))"
             )
         service = self.service(srv_type, srv_name, None)
         # A session that was just opened does not know the graph yet.

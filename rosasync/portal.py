@@ -270,7 +270,8 @@ class _Submission(Future[Any]):
         elapsed = time.monotonic() - self._submitted
         srv_name, srv_type, _ = self._service.key
         raise ResponseTimeout(
-            f"{srv_name}: the session's loop is stuck: it did not answer for {elapsed:.3g} s",
+            f"{srv_name}: the session's loop is stuck: it did not react for {elapsed:.3g} s, so a "
+            "task or a callback blocks it",
             srv_name=srv_name,
             srv_type=srv_type,
             elapsed=elapsed,

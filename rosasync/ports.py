@@ -247,6 +247,13 @@ class NodePort(Protocol):
     def explain_missing(self, service: Service) -> str:
         """Describe what the graph shows instead of this service, as a clause."""
 
+    def explain_mismatch(self, service: Service) -> str | None:
+        """Describe the servers of the name as a clause, if all of them have another type.
+
+        Raises:
+            ContextShutdown: the node is down.
+        """
+
     def stop(self) -> None:
         """Ask the executor thread to end. From any thread; idempotent; takes no lock."""
 

@@ -214,7 +214,9 @@ class AsyncServiceProxy(Generic[RequestT, ResponseT]):
 
     def _start(self, operation: _Operation) -> None:
         if self._closed:
-            raise UsageError(f"{self._service.key.srv_name}: the proxy was shut down")
+            raise UsageError(
+                f"{self._service.key.srv_name}: the proxy was shut down: create a new one"
+            )
         self._replace(operation)
         if self._closed:
             # Another thread has shut the proxy down since the check.

@@ -323,7 +323,8 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         if call.give_up("dropped: too many requests were waiting") and not self._overload_logged:
             self._overload_logged = True
             logger.warning(
-                "%s: %d requests wait already, so further ones are dropped unanswered (%d so far)",
+                "%s: %d requests wait already, so further ones are dropped unanswered (%d so far): "
+                "raise concurrency or backlog, or answer them with on_overload",
                 self._name,
                 len(self._queue),
                 self._counts.dropped,
@@ -368,7 +369,8 @@ class ServiceServer(Generic[RequestT, ResponseT]):
             await self._tasks.wait(self._loop.time() + CANCEL_TIMEOUT)
             if self._tasks:
                 logger.warning(
-                    "%s: %d handlers ignore their cancellation and are left behind",
+                    "%s: %d handlers still run although they were cancelled, and are left behind: "
+                    "a handler must not suppress CancelledError",
                     self._name,
                     len(self._tasks),
                 )

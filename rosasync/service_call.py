@@ -108,7 +108,8 @@ class ServiceCall(Generic[RequestT, ResponseT]):
     def __del__(self) -> None:
         if self._outcome is None and self._sender.count_collected(self.trace):
             warnings.warn(
-                f"{self._sender.name}: a call was dropped unanswered",
+                f"{self._sender.name}: a call was dropped unanswered, so its client waits in vain: "
+                "keep the call, and call its respond() once",
                 ResourceWarning,
                 source=self,
                 stacklevel=2,
@@ -323,7 +324,7 @@ class ResponseSender(Generic[ResponseT]):
         """Count and log a response that cannot be delivered."""
         with self.lock:
             self._counts.undeliverable += 1
-        logger.warning("%s: the response of %r cannot be delivered: %s", self.name, call, reason)
+        logger.warning("%s: the response to %r cannot be delivered: %s", self.name, call, reason)
         if call.trace is not None:
             call.trace.end("undeliverable")
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Generic, Literal, NoReturn, Self, overload
 
-from rosasync.aio import start_task
+from rosasync.aio import call_in_thread, start_task
 from rosasync.core import Core, session_closed
 from rosasync.errors import UsageError
 from rosasync.options import Limits, Retry, SessionOptions, check_timeout
@@ -96,8 +96,9 @@ class Session:
             trace=trace,
         )
         self._core: Core | None = None
-        # Whether it was closed before it was opened. Once it is open, `Core.closed` counts.
+        # Whether it was closed before it was open. Once it is open, `Core.closed` counts.
         self._closed = False
+        self._opening = False
 
     def __repr__(self) -> str:
         core = self._core
@@ -109,16 +110,29 @@ class Session:
     async def __aenter__(self) -> Self:
         """Open the session in the running loop.
 
+        The first opening in a process imports rclpy, in a thread, while the loop runs other tasks.
+        Then it creates the context and the node, which blocks the loop for some tens of
+        milliseconds. A cancellation takes effect after the import, and leaves nothing behind.
+
         Raises:
             ImportError: rclpy is not installed, or the middleware that ``RMW_IMPLEMENTATION``
                 names; the message says what to do.
             UsageError: the session was opened before, or the bridge asked for does not work here.
             TypeError: ``node`` is neither a name nor an rclpy node.
             ValueError: ROS does not allow the node's name.
-            OSError: the process is out of file descriptors or threads.
+            SessionClosed: the session was closed during the opening.
+            OSError: the process is out of file descriptors.
+            RuntimeError: the process is out of threads.
         """
-        if self._core is not None or self._closed:
+        if self._core is not None or self._closed or self._opening:
             raise UsageError("a session can be opened only once: create a new one")
+        self._opening = True
+        try:
+            await self._load()
+        finally:
+            self._opening = False
+        if self._closed:
+            raise session_closed()
         self._core = Core(self, self._options, self._open_node)
         return self
 
@@ -236,7 +250,8 @@ class Session:
             timeout: seconds for the whole call, None for no deadline; if left out, the session's.
             qos: a ``QoSProfile``; None for the service default with a history of 1,000, or of
                 ``Limits.in_flight``, at least 10, without rosasync's Fast DDS profile.
-            wait: False to fail at once if there is no server.
+            wait: False to fail at once if there is no server, or none of this type. A call that
+                waits while the name is served as another type logs a warning after one second.
             retry: when to send an unanswered request again; only for services that may run twice.
 
         Raises:
@@ -496,6 +511,10 @@ class Session:
         self._core.check_loop()
         await self._core.aclose()
 
+    async def _load(self) -> None:
+        """Import what `_open_node` needs. The session of `rosasync.testing` overrides this."""
+        await call_in_thread(_load_ros, "rosasync import")
+
     def _open_node(
         self, gateway: LoopGateway, on_graph: Callable[[], None], on_shutdown: Callable[[], None]
     ) -> NodePort:
@@ -585,6 +604,12 @@ class ServiceClient(Generic[RequestT, ResponseT]):
 
 def _not_open() -> UsageError:
     return UsageError("the session is not open: use `async with rosasync.Session(…) as session:`")
+
+
+def _load_ros() -> None:
+    """Import rclpy and what it loads for the first node; raises as `_import_ros`."""
+    _import_ros("rosasync.ros.node")
+    _import_ros("rosasync.ros.type_supports").load()
 
 
 def _import_ros(module: str) -> Any:

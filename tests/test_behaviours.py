@@ -422,7 +422,7 @@ class TestSetup:
         assert await ticked(leaf) is Status.SUCCESS
 
     async def test_without_a_session(self) -> None:
-        with pytest.raises(KeyError, match="'session'"):
+        with pytest.raises(KeyError, match="has no session: call tree.setup"):
             CallService("a", ECHO, NAME).setup()
 
     async def test_without_setup(self) -> None:

@@ -176,3 +176,40 @@ def test_columns_limit_the_width() -> None:
     with terminal("why", "/lamp/swich", COLUMNS="50") as command:
         assert command.end() == 3
     assert max(len(line) for line in command.screen.splitlines()) <= 50
+
+
+SWITCHED_OFF = ("applies no Fast DDS profile", "does not introduce itself at its start")
+
+
+@pytest.mark.parametrize(
+    ("command", "value", "expected"),
+    [
+        (("why", LAMP), "OFF", SWITCHED_OFF),
+        (("why", LAMP), "on", ("has no effect: only the value off has",)),
+        (("doctor",), "off", SWITCHED_OFF),
+    ],
+)
+def test_the_profile_switch_is_explained(
+    command: tuple[str, ...], value: str, expected: tuple[str, ...]
+) -> None:
+    checks = json_lines(rosasync(*command, "--json", ROSASYNC_PROFILE=value).stdout)
+    (switch,) = [check for check in checks if check["check"] == "profile switch"]
+    assert switch["ok"] is None
+    for part in (f"ROSASYNC_PROFILE={value}", *expected):
+        assert part in switch["found"]
+    assert "Unset ROSASYNC_PROFILE" in switch["todo"]
+
+
+@pytest.mark.parametrize(
+    ("environ", "expected"),
+    [
+        ({}, "rosasync's own in sessions"),
+        ({"ROSASYNC_PROFILE": "off"}, "none: ROSASYNC_PROFILE=off"),
+        ({PROFILE: __file__}, f"yours, {__file__}, instead of rosasync's"),
+    ],
+)
+def test_doctor_says_which_profile_is_in_use(environ: dict[str, str], expected: str) -> None:
+    checks = json_lines(rosasync("doctor", "--json", **environ).stdout)
+    (used,) = [check for check in checks if check["check"] == "profile"]
+    assert used["ok"] is None
+    assert expected in used["found"]

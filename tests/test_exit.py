@@ -94,6 +94,31 @@ asyncio.run(main())
         assert "KeyboardInterrupt" in errors
         assert "ResourceWarning" not in errors
 
+    async def test_ctrl_c_that_another_thread_gets_wakes_an_idle_loop_with_a_signal_handler(
+        self, bridge: Bridge
+    ) -> None:
+        """As `docs/how-to/deploy.md` says. Without the handler, the idle loop goes on sleeping."""
+        program = """
+import signal, threading, time
+def interrupt():
+    time.sleep(2.0)  # The pool polls for a moment after a call.
+    signal.pthread_kill(threading.get_ident(), signal.SIGINT)
+async def main():
+    stop = asyncio.Event()
+    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, stop.set)
+    async with Session("idle", bridge=bridge, timeout=None) as session:
+        # A deadline would be a timer, which wakes the loop.
+        await check_call(session, "/echo", "text", timeout=None)
+        print("called", flush=True)
+        threading.Thread(target=interrupt).start()
+        await stop.wait()
+asyncio.run(main())
+"""
+        code, errors = await run_program(bridge, program)
+        assert code in (130, -signal.SIGINT), errors
+        assert "KeyboardInterrupt" in errors
+        assert "ResourceWarning" not in errors
+
     async def test_a_loop_closed_under_an_open_session(
         self, bridge: Bridge, server: ServerProcess
     ) -> None:

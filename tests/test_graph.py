@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from typing import TYPE_CHECKING
+import re
+from collections.abc import Callable, Coroutine
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from rclpy.qos import QoSProfile, QoSReliabilityPolicy
 
-from rosasync import ServiceUnavailable, Session
+from rosasync import AsyncServiceProxy, Limits, ProxyState, ServiceUnavailable, Session
+from rosasync.service_pool import MISMATCH_DELAY
+from rosasync.testing import FakeGraph, VirtualClock
 from tests.support.checks import assert_clean, check_call
 from tests.support.echo import ECHO, answer_to, request_of
 from tests.support.servers import ServerProcess
@@ -17,6 +21,19 @@ from tests.support.times import LIMIT, TICK, until
 
 if TYPE_CHECKING:
     from tests.conftest import Bridge
+
+
+TRIGGER = "std_srvs/srv/Trigger"
+MISMATCH = "is served as std_srvs/srv/SetBool by node /stock_server"
+
+
+def warnings_of(caplog: pytest.LogCaptureFixture) -> list[str]:
+    """Return what rosasync has warned of."""
+    return [
+        record.getMessage()
+        for record in caplog.records
+        if record.name.startswith("rosasync") and record.levelno == logging.WARNING
+    ]
 
 
 async def seen(session: Session, name: str) -> None:
@@ -80,6 +97,116 @@ class TestUnavailable:
         await assert_clean(session)
 
 
+Wait = Callable[[Session, str], Coroutine[Any, Any, object]]
+
+
+async def by_call(session: Session, name: str) -> None:
+    await session.call(TRIGGER, name, timeout=None)
+
+
+async def by_lease(session: Session, name: str) -> None:
+    async with session.pool.lease(TRIGGER, name, timeout=None):
+        pass
+
+
+async def by_wait(session: Session, name: str) -> None:
+    await session.wait_for_service(TRIGGER, name)
+
+
+async def by_proxy_call(session: Session, name: str) -> None:
+    AsyncServiceProxy(session, TRIGGER, name).call_service(timeout=None)
+
+
+async def by_proxy_wait(session: Session, name: str) -> None:
+    AsyncServiceProxy(session, TRIGGER, name).wait_for_service()
+
+
+async def by_warming(session: Session, name: str) -> None:
+    await session.pool.warm(TRIGGER, name)
+
+
+WAITS: list[Wait] = [by_call, by_lease, by_wait, by_proxy_call, by_proxy_wait, by_warming]
+
+
+class TestAnotherType:
+    """A server of another type: who does not want to wait fails at once, who waits is warned."""
+
+    @pytest.fixture
+    async def mismatched(self, session: Session, server: ServerProcess) -> Session:
+        await server.serve("/enable", "std_srvs/srv/SetBool")
+        await seen(session, "/enable")
+        return session
+
+    async def test_without_waiting(self, mismatched: Session) -> None:
+        proxy = AsyncServiceProxy(mismatched, TRIGGER, "/enable")
+        async with asyncio.timeout(LIMIT):
+            with pytest.raises(ServiceUnavailable, match=MISMATCH):
+                await mismatched.call(TRIGGER, "/enable", wait=False, timeout=None)
+            proxy.call_service(wait=False, timeout=None)
+            await until(lambda: proxy.get_state() is ProxyState.TIMEOUT)
+        assert [type(error) for error in proxy.get_errors()] == [ServiceUnavailable]
+        await assert_clean(mismatched)
+
+    @pytest.mark.parametrize("wait", WAITS)
+    async def test_a_warning_once(
+        self, mismatched: Session, caplog: pytest.LogCaptureFixture, wait: Wait
+    ) -> None:
+        waiting = [asyncio.create_task(wait(mismatched, "/enable")) for _ in range(3)]
+        await until(lambda: warnings_of(caplog))
+        await asyncio.sleep(10 * TICK)
+        [warning] = warnings_of(caplog)
+        assert re.match(
+            f"/enable: callers wait for .* {TRIGGER}, but this name {MISMATCH}", warning
+        )
+        for task in waiting:
+            task.cancel()
+        await asyncio.gather(*waiting, return_exceptions=True)
+
+    async def test_no_warning_before_a_second_has_passed(
+        self, fake_graph: FakeGraph, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        fake_graph.serve("std_srvs/srv/SetBool", "/enable", lambda request: None)
+        clock = VirtualClock()
+        async with fake_graph.session() as session:
+            waiting = session.start(TRIGGER, "/enable", timeout=None)
+            await clock.advance(0.9 * MISMATCH_DELAY)
+            assert warnings_of(caplog) == []
+            await clock.advance(MISMATCH_DELAY)
+            assert len(warnings_of(caplog)) == 1
+            waiting.cancel()
+
+    async def test_no_warning_while_there_is_no_server_or_a_fitting_one(
+        self, fake_graph: FakeGraph, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        clock = VirtualClock()
+        fake_graph.serve(TRIGGER, "/busy", lambda request: None)
+        fake_graph.serve("std_srvs/srv/SetBool", "/busy", lambda request: None)
+        async with fake_graph.session(limits=Limits(in_flight=1)) as session:
+            with fake_graph.drop_responses():
+                calls = [
+                    session.start(TRIGGER, name, timeout=None)
+                    for name in ("/absent", "/busy", "/busy")
+                ]
+                await clock.advance(5 * MISMATCH_DELAY)
+            assert warnings_of(caplog) == []
+            for call in calls:
+                call.cancel()
+
+    async def test_another_warning_for_another_type(
+        self, fake_graph: FakeGraph, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        clock = VirtualClock()
+        async with fake_graph.session() as session:
+            waiting = session.start(TRIGGER, "/enable", timeout=None)
+            for kind in ("std_srvs/srv/SetBool", "std_srvs/srv/Empty"):
+                server = fake_graph.serve(kind, "/enable", lambda request: None)
+                await clock.advance(3 * MISMATCH_DELAY)
+                assert kind in warnings_of(caplog)[-1]
+                server.close()
+            assert len(warnings_of(caplog)) == 2
+            waiting.cancel()
+
+
 class TestAppearing:
     """Servers that start after the call."""
 
@@ -135,11 +262,7 @@ class TestSeveralServers:
             )
             for number in range(5):
                 await check_call(session, name, str(number))
-        warnings = [
-            record.getMessage()
-            for record in caplog.records
-            if record.name.startswith("rosasync") and record.levelno == logging.WARNING
-        ]
+        warnings = warnings_of(caplog)
         assert len(warnings) == 2, warnings
         assert "/twins" in warnings[0]
         assert "/triplets" in warnings[1]

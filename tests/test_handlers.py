@@ -275,7 +275,7 @@ class TestErrors:
         task = ask(session, "/served", "text", timeout=None)
         await until(lambda: server.statistics().dropped == 1)
         assert [record.message for record in caplog.records] == [
-            f"/served: the handler of {_repr_of(1)} was cancelled"
+            f"/served: the handler of {_repr_of(1)} was cancelled, so its client gets no response"
         ]
         await discard(task)
 

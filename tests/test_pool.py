@@ -544,7 +544,7 @@ async def test_several_servers_of_one_name_are_warned_of_once(
                 assert await ask(session, value) == value
             fake_graph.changed()
             assert await ask(session, 3) == 3
-    assert [r.getMessage().split(";")[0] for r in caplog.records] == [
+    assert [r.getMessage().split(".")[0] for r in caplog.records] == [
         "/echo: 2 servers answer this name"
     ]
 

@@ -7,16 +7,18 @@ from collections.abc import AsyncIterator
 from typing import Any
 
 import pytest
+import rclpy
 from diagnostic_msgs.srv import AddDiagnostics
 from rclpy.duration import Duration
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
-from std_srvs.srv import Trigger
+from std_srvs.srv import SetBool, Trigger
 
 from rosasync.errors import UsageError
 from rosasync.ros import endpoints, graph, node
 from rosasync.ros.endpoints import gid_of, incompatibility, response_writers
 from rosasync.ros.graph import GraphQueries, GraphWaitable
 from tests.conftest import Bridge
+from tests.support.echo import ECHO
 from tests.support.nodes import Opened, borrowed_node, open_node
 from tests.support.times import until
 
@@ -28,6 +30,13 @@ DEADLINE = QoSProfile(depth=10, deadline=Duration(seconds=1))
 @pytest.fixture
 async def opened() -> AsyncIterator[Opened]:
     async with open_node("direct") as opened:
+        yield opened
+
+
+@pytest.fixture
+async def lonely(own_domain: None) -> AsyncIterator[Opened]:
+    """A node that sees no other one."""
+    async with open_node("direct", "lonely") as opened:
         yield opened
 
 
@@ -145,28 +154,122 @@ class TestMissing:
             lender.create_service(AddDiagnostics, "/echo", nothing)
             await until(lambda: "/echo" in opened.ros.explain_missing(missing))
 
-    async def test_only_services_of_its_own(self, opened: Opened) -> None:
-        missing = opened.service("/ecco")
-        assert "no other node's services are visible" in opened.ros.explain_missing(missing)
-        opened.serve("/own")
-        await until(lambda: opened.ros.node.count_services("/own"))
-        assert "no other node's services are visible" in opened.ros.explain_missing(missing)
+    async def test_no_other_node(self, lonely: Opened) -> None:
+        missing = lonely.service("/ecco")
+        domain = lonely.ros.node.context.get_domain_id()
+        expected = (
+            f"no other node is visible in domain {domain} with discovery range LOCALHOST and "
+            f"{rclpy.get_rmw_implementation_identifier()}: start the server, or compare its ROS_DOM"
+        )
+        assert expected in lonely.ros.explain_missing(missing)
+        lonely.serve("/own")
+        await until(lambda: lonely.ros.node.count_services("/own"))
+        assert expected in lonely.ros.explain_missing(missing)
+        with borrowed_node():
+            await until(lambda: "no other node" not in lonely.ros.explain_missing(missing))
+
+    async def test_only_services_of_other_nodes_count(self, lonely: Opened) -> None:
+        """Those of a node of the same name too: the graph shows the two as one."""
+        missing = lonely.service("/zzz", ECHO)
+        lonely.serve("/own", Trigger)
+        with borrowed_node(lonely.ros.name) as twin:
+            twin.create_service(Trigger, "/far", nothing)
+            own = len(list(twin.services))
+            await until(
+                lambda: f"among {own} services of other" in lonely.ros.explain_missing(missing)
+            )
+            assert "there are /far" in lonely.ros.explain_missing(lonely.service("/z", Trigger))
+
+    @pytest.mark.parametrize(
+        ("setting", "expected"),
+        [
+            ({}, "range SUBNET and"),
+            ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "off"}, "range OFF and"),
+            ({"ROS_LOCALHOST_ONLY": "1"}, "range LOCALHOST (ROS_LOCALHOST_ONLY=1) and"),
+        ],
+    )
+    async def test_the_discovery_range(
+        self,
+        lonely: Opened,
+        monkeypatch: pytest.MonkeyPatch,
+        setting: dict[str, str],
+        expected: str,
+    ) -> None:
+        for name in ("ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_LOCALHOST_ONLY"):
+            monkeypatch.delenv(name, raising=False)
+        for name, value in setting.items():
+            monkeypatch.setenv(name, value)
+        assert expected in lonely.ros.explain_missing(lonely.service("/ecco"))
+
+    async def test_another_type(self, opened: Opened) -> None:
+        service = opened.service()
+        assert opened.ros.explain_mismatch(service) is None
         with borrowed_node() as lender:
-            lender.create_service(Trigger, "/far", nothing)
+            lender.create_service(Trigger, "/echo", nothing)
+            expected = "this name is served as std_srvs/srv/Trigger by node /lender"
+            await until(lambda: opened.ros.explain_mismatch(service) == expected)
+            assert opened.ros.explain_missing(service) == expected
+            assert opened.ros.explain_mismatch(opened.service(srv_type=Trigger)) is None
+
+    async def test_other_types_of_two_nodes_of_the_same_name(self, opened: Opened) -> None:
+        """In a query by node, the one hides the other's services."""
+        service = opened.service()
+        with borrowed_node("twin") as first, borrowed_node("twin") as second:
+            first.create_service(Trigger, "/echo", nothing)
+            second.create_service(SetBool, "/echo", nothing)
+            expected = (
+                "this name is served as std_srvs/srv/SetBool by node /twin "
+                "and as std_srvs/srv/Trigger by node /twin"
+            )
+            await until(lambda: opened.ros.explain_mismatch(service) == expected)
+            similar = opened.service("/ecoo")
+            assert "/echo (std_srvs/srv/SetBool, std_srvs/srv/Trigger)" in (
+                opened.ros.explain_missing(similar)
+            )
+
+    async def test_another_type_if_the_topics_have_other_names(
+        self, opened: Opened, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(endpoints, "response_writers", lambda *_: [])
+        with borrowed_node() as lender:
+            lender.create_service(Trigger, "/echo", nothing)
+            expected = "this name is served as std_srvs/srv/Trigger by node /lender"
+            await until(lambda: opened.ros.explain_missing(opened.service()) == expected)
+
+    async def test_a_node_that_is_not_known_yet(
+        self, opened: Opened, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(
+            graph, "servers_of", lambda *_: [endpoints.Endpoint("", "std_srvs/srv/Trigger", None)]
+        )
+        with borrowed_node() as lender:
+            lender.create_service(Trigger, "/echo", nothing)
+            expected = "this name is served as std_srvs/srv/Trigger"
+            await until(lambda: opened.ros.explain_missing(opened.service()) == expected)
+
+    async def test_the_right_type_among_others_is_no_mismatch(self, opened: Opened) -> None:
+        with borrowed_node() as lender, borrowed_node("other") as other:
+            lender.create_service(Trigger, "/echo", nothing)
+            other.create_service(SetBool, "/echo", nothing)
+            service = opened.service(srv_type=SetBool)
+            await until(lambda: opened.ros.node.count_services("/echo") == 2)
+            assert opened.ros.explain_mismatch(service) is None
             await until(
                 lambda: (
-                    "among" in opened.ros.explain_missing(opened.service("/zzz", Trigger))
-                    or "/far" in opened.ros.explain_missing(opened.service("/zzz", Trigger))
+                    "served by node /other, but not matched" in opened.ros.explain_missing(service)
                 )
             )
 
-    async def test_the_type_and_the_qos(self, opened: Opened) -> None:
+    async def test_another_qos(self, opened: Opened) -> None:
         with borrowed_node() as lender:
             lender.create_service(Trigger, "/echo", nothing)
-            await until(lambda: opened.ros.node.count_services("/echo"))
-            assert "served as std_srvs/srv/Trigger" in opened.ros.explain_missing(opened.service())
             service = opened.service(srv_type=Trigger, qos=BEST_EFFORT)
-            assert "compare the QoS" in opened.ros.explain_missing(service)
+            expected = (
+                "this name and type are served by node /lender, but with a QoS that does not fit "
+                "the client's (Best effort publisher and reliable subscription): call with qos= "
+                "and the server's QoS"
+            )
+            await until(lambda: opened.ros.explain_missing(service) == expected)
 
 
 class TestEvents:

@@ -12,7 +12,6 @@ import sys
 import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
-from importlib.metadata import version
 from pathlib import Path
 
 import rosasync
@@ -21,6 +20,7 @@ from rosasync.cli.errors import Code
 from rosasync.cli.options import AsJson
 from rosasync.cli.run import open_session, run
 from rosasync.cli.why import environment
+from rosasync.profile import SWITCH, is_old, profile_variable, switched_off, user_profile
 from rosasync.ros.middleware import check_middleware, installed_middlewares
 
 __all__ = ["doctor"]
@@ -34,9 +34,10 @@ MULTICAST = "239.255.0.1"
 
 DISCOVERY, SLOW = 10.0, 1.0
 SRV_TYPE = "diagnostic_msgs/srv/AddDiagnostics"
-SWITCH = "ROSASYNC_PROFILE"
-OLD_PROFILE, NEW_PROFILE = "FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"
-"""The variable that Fast DDS reads up to version 2 (ROS 2 Jazzy), and from 3 on (Kilted)."""
+
+PROFILE_HINT = (
+    "Where packets get lost, give other nodes the profile that repairs it: rosasync profile"
+)
 
 
 def doctor(as_json: AsJson = False) -> None:
@@ -132,22 +133,23 @@ def _multicast(report: Report) -> None:
 
 def _profile(report: Report) -> None:
     """Say which profile of Fast DDS is in use."""
-    old = version("rclpy").startswith("7.")
-    read, other = (OLD_PROFILE, NEW_PROFILE) if old else (NEW_PROFILE, OLD_PROFILE)
-    found = {name: os.environ[name] for name in (SWITCH, read, other) if os.environ.get(name)}
-    shown = ", ".join(f"{name}={value}" for name, value in found.items())
-    if read not in found and other in found:
+    old = is_old()
+    read, other = profile_variable(old), profile_variable(not old)
+    if os.environ.get(other) and not os.environ.get(read):
+        shown = f"{other}={os.environ[other]}"
         report.add("profile", False, shown, f"This Fast DDS reads {read} instead")
-    elif read in found and not Path(found[read]).is_file():
-        report.add("profile", False, shown, "There is no such file")
+    elif (file := user_profile(old)) and not file.is_file():
+        report.add("profile", False, f"{read}={file}", "There is no such file")
     else:
-        report.add("profile", None, shown or "none in the environment", _profile_hint())
+        report.add("profile", None, _profile_in_use(file), PROFILE_HINT)
 
 
-def _profile_hint() -> str:
-    if importlib.util.find_spec("rosasync.cli.profile") is None:
-        return ""
-    return "Where packets get lost, give other nodes the profile that repairs it: rosasync profile"
+def _profile_in_use(file: Path | None) -> str:
+    if file:
+        return f"yours, {file}, instead of rosasync's"
+    if switched_off():
+        return f"none: {SWITCH}={os.environ[SWITCH]}, and you have none"
+    return "rosasync's own in sessions, none in other nodes started from here"
 
 
 async def _calls(report: Report) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import os
 import signal
 import socket
@@ -15,6 +16,7 @@ import typer
 
 import rosasync
 from rosasync.cli.errors import CliError, Code, code_of, line_of
+from rosasync.service_pool import MISMATCH_LOGGER
 
 __all__ = ["fail", "open_session", "run", "silence_stdout"]
 
@@ -25,6 +27,8 @@ def run(command: Coroutine[Any, Any, int | None]) -> None:
     Raises:
         typer.Exit: always, with the exit code.
     """
+    # The command ends with an error that says the same.
+    logging.getLogger(MISMATCH_LOGGER).setLevel(logging.ERROR)
     try:
         code = asyncio.run(_woken_by_signals(command)) or Code.ANSWERED
         sys.stdout.flush()

@@ -11,6 +11,7 @@ from rosasync.cli.errors import Code
 from rosasync.cli.graph import explain_type, is_hidden, resolve, settle
 from rosasync.cli.options import AsJson, Name, OptionalType, Wait
 from rosasync.cli.run import open_session, run
+from rosasync.profile import SWITCH, switched_off
 from rosasync.ros.messages import service_type
 
 __all__ = ["environment", "why"]
@@ -50,7 +51,33 @@ async def _why(name: str, srv_type: str | None, as_json: bool, wait: float | Non
 
 
 def environment(report: Report) -> None:
-    """Check the variables that decide which processes are discovered."""
+    """Check the variables that decide which processes are discovered, and how soon."""
+    _domain_and_range(report)
+    _switch(report)
+
+
+def _switch(report: Report) -> None:
+    """Say what ``ROSASYNC_PROFILE`` means, if it is set."""
+    value = os.environ.get(SWITCH)
+    if switched_off():
+        report.add(
+            "profile switch",
+            None,
+            f"{SWITCH}={value}: a session applies no Fast DDS profile of its own, so a lost "
+            "request is repaired after 3 s instead of 20 ms; and it does not introduce itself at "
+            "its start, so servers on this host may be found up to 3 s later",
+            f"Unset {SWITCH}, unless that is what you want",
+        )
+    elif value:
+        report.add(
+            "profile switch",
+            None,
+            f"{SWITCH}={value} has no effect: only the value off has",
+            f"Unset {SWITCH}, or set it to off",
+        )
+
+
+def _domain_and_range(report: Report) -> None:
     domain = os.environ.get("ROS_DOMAIN_ID") or "0"
     report.add("domain", None, f"{domain} (ROS_DOMAIN_ID); both sides need the same")
     if os.environ.get("ROS_LOCALHOST_ONLY") == "1":

@@ -292,7 +292,11 @@ class DirectClient:
         if is_destroyed(self.handle):
             self._pending.clear()
         else:
-            logger.error("a response could not be taken: %s", error)
+            logger.error(
+                "a response could not be read, and its call will time out: compare the versions "
+                "of the type's package on both sides (%s)",
+                error,
+            )
 
     def _failure(self, error: Exception) -> Exception:
         return explain(self._node, self.handle, error)

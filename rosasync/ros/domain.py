@@ -39,7 +39,9 @@ def isolate() -> int:
         os.environ["ROS_DOMAIN_ID"] = str(domain)
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
         return domain
-    raise RuntimeError("all ROS domains from 1 to 101 are claimed by running processes")
+    raise RuntimeError(
+        "all ROS domains from 1 to 101 are claimed by running processes: end some of them"
+    )
 
 
 def isolate_once() -> int:

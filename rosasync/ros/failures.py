@@ -51,7 +51,7 @@ def explain(node: Node, handle: Any, error: Exception) -> Exception:
         return ContextShutdown()
     if is_destroyed(handle):
         return PortDestroyed("the rclpy client or service was destroyed")
-    return RosasyncError(f"rclpy failed: {error}")
+    return RosasyncError(f"rclpy reports an error of a client or service: {error}")
 
 
 @contextmanager
@@ -67,7 +67,7 @@ def uses_node(node: Node) -> Iterator[None]:
         yield
     except RclpyError as error:
         check_up(node)
-        raise RosasyncError(f"rclpy failed: {error}") from error
+        raise RosasyncError(f"rclpy reports an error of the node: {error}") from error
 
 
 def refusal(node: Node, service: Service, kind: str, error: Exception) -> Exception:

@@ -4,19 +4,30 @@ from __future__ import annotations
 
 import contextlib
 import difflib
-from collections.abc import Callable, Hashable
+import os
+from collections import Counter
+from collections.abc import Callable, Hashable, Iterable
 from time import monotonic
 from types import TracebackType
 from typing import Any
 from weakref import WeakValueDictionary
 
+import rclpy
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
+from rclpy.qos import QoSProfile
 from rclpy.waitable import NumberOfEntities, Waitable
 
 from rosasync.ports import Service
-from rosasync.ros.endpoints import gid_of, response_writers, serves
+from rosasync.ros.endpoints import (
+    Endpoint,
+    gid_of,
+    incompatibility,
+    response_writers,
+    servers_of,
+    serves,
+)
 from rosasync.ros.failures import uses_node
 from rosasync.ros.names import default_qos
 from rosasync.ros.rcl import Rcl
@@ -107,7 +118,10 @@ class GraphQueries:
         self._node = node
         self._events = events
         self._generation = 0
+        # The snapshot: all of one generation. The last two are queried when they are first needed.
         self._served: dict[str, set[str]] = {}
+        self._servers: dict[str, list[Endpoint]] = {}
+        self._others: dict[str, set[str]] | None = None
         self._served_generation = -1
         self._served_until = 0.0
 
@@ -142,29 +156,55 @@ class GraphQueries:
         """Describe what the graph shows instead of this service, as a clause."""
         srv_name, srv_type, _ = service.key
         with uses_node(self._node):
-            services = self._services()
-            if types := services.get(srv_name):
-                return self._explain_mismatch(srv_name, srv_type, types)
-            if services.keys() <= self._own_services():
-                return (
-                    "no server has this name, and no other node's services are visible: compare "
-                    "ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE with the server's"
-                )
+            if self._count_servers(srv_name):
+                return self.explain_mismatch(service) or self._explain_unmatched(service)
+            services = self._others_services()
+            if not services and len(self._node.get_node_names()) <= 1:
+                return f"no server has this name, and no other node is visible in {self._place()}"
         same_type = sorted(name for name, types in services.items() if srv_type in types)
         similar = difflib.get_close_matches(srv_name, services, n=3, cutoff=0.7)
         if names := list(dict.fromkeys([*similar, *same_type[:3]])):
             listed = ", ".join(f"{name} ({', '.join(sorted(services[name]))})" for name in names)
             return f"no server has this name; there are {listed}"
-        return f"no server has this name or a similar one, among {len(services)} services"
+        return (
+            f"no server has this name or a similar one, among {len(services)} services of other "
+            "nodes: start the server, or compare its name and namespace"
+        )
 
-    def _explain_mismatch(self, srv_name: str, srv_type: str, types: set[str]) -> str:
-        servers = self._count_servers(srv_name)
-        if srv_type in types:
+    def explain_mismatch(self, service: Service) -> str | None:
+        """Describe the servers of the name as a clause, if all of them have another type."""
+        srv_name, srv_type, _ = service.key
+        with uses_node(self._node):
+            servers = self._servers_of(srv_name) if self._count_servers(srv_name) else []
+        # A server whose type is not known yet may be the right one.
+        if not servers or any(server.srv_type in (srv_type, "") for server in servers):
+            return None
+        kinds = sorted({server.srv_type for server in servers})
+        served = [f"{k}{_by([s for s in servers if s.srv_type == k])}" for k in kinds]
+        return f"this name is served as {' and as '.join(served)}"
+
+    def _explain_unmatched(self, service: Service) -> str:
+        srv_name, srv_type, _ = service.key
+        servers = [s for s in self._servers_of(srv_name) if s.srv_type == srv_type]
+        where = _by(servers)
+        if problem := next(filter(None, (_qos_problem(service, s.qos) for s in servers)), None):
             return (
-                f"{servers} server(s) of this name and type are in the graph but not matched "
-                "with the client: compare the QoS"
+                f"this name and type are served{where}, but with a QoS that does not fit the "
+                f"client's ({problem}): call with qos= and the server's QoS"
             )
-        return f"this name is served as {', '.join(sorted(types))} ({servers} server(s))"
+        return (
+            f"this name and type are served{where}, but not matched with the client yet: compare "
+            "the QoS, and wait longer if the server or this process has just started"
+        )
+
+    def _place(self) -> str:
+        """Return where this node looks for others, and what to compare."""
+        return (
+            f"domain {self._node.context.get_domain_id()} with discovery range "
+            f"{_discovery_range()} and {rclpy.get_rmw_implementation_identifier()}: start the "
+            "server, or compare its ROS_DOMAIN_ID, ROS_AUTOMATIC_DISCOVERY_RANGE and "
+            "RMW_IMPLEMENTATION"
+        )
 
     def _services(self) -> dict[str, set[str]]:
         """Return the types of every service that has a server, as they were a moment ago.
@@ -176,6 +216,7 @@ class GraphQueries:
         if self._served_generation != self._generation or not fresh:
             # Read before the queries, so that a change during them discards the snapshot.
             generation = self._generation
+            self._servers, self._others = {}, None
             self._served = self._query_services()
             self._served_generation = generation
             self._served_until = now + SNAPSHOT_TIME
@@ -185,32 +226,65 @@ class GraphQueries:
         """Query the types of every service that has a server.
 
         The graph lists a name with the types of its servers and of its clients, including this
-        session's. If they differ, each node is asked for the types that it serves. That answer may
-        be some milliseconds old.
+        session's. If they differ, the servers are asked.
         """
         services: dict[str, set[str]] = {}
         for srv_name, types in self._node.get_service_names_and_types():
             if self._count_servers(srv_name):
-                known = self._query_nodes(srv_name) if len(types) > 1 else None
+                known = len(types) > 1 and {s.srv_type for s in servers_of(self._node, srv_name)}
                 services[srv_name] = known or set(types)
         return services
 
-    def _query_nodes(self, srv_name: str) -> set[str]:
-        types: set[str] = set()
-        for node in self._node.get_node_names_and_namespaces():
-            types.update(self._services_of(*node).get(srv_name, ()))
-        return types
+    def _servers_of(self, srv_name: str) -> list[Endpoint]:
+        """Return the servers of a resolved name, as they were a moment ago."""
+        self._services()
+        if srv_name not in self._servers:
+            self._servers[srv_name] = servers_of(self._node, srv_name)
+        return self._servers[srv_name]
 
-    def _own_services(self) -> set[str]:
-        return set(self._services_of(self._node.get_name(), self._node.get_namespace()))
+    def _others_services(self) -> dict[str, set[str]]:
+        """Return the services that have a server which is not this node's own.
 
-    def _services_of(self, name: str, namespace: str) -> dict[str, list[str]]:
-        # The node may have left the graph since it was listed.
-        with contextlib.suppress(rclpy_implementation.NodeNameNonExistentError):
-            return dict(self._node.get_service_names_and_types_by_node(name, namespace))
-        return {}
+        The node's own are counted, because the graph shows nodes of the same name as one.
+        """
+        services = self._services()
+        if self._others is None:
+            own = Counter(_names_of(self._node.services))
+            self._others = {n: t for n, t in services.items() if self._count_servers(n) > own[n]}
+        return self._others
 
     def _count_servers(self, srv_name: str) -> int:
         """Return how many servers of this resolved name the graph shows, of any type."""
         with self._node.handle:
             return int(self._node.handle.get_count_services(srv_name))
+
+
+def _names_of(services: Iterable[Any]) -> list[str]:
+    """Return the resolved names of a node's services, except those that were just destroyed."""
+    names = []
+    for service in tuple(services):
+        with contextlib.suppress(InvalidHandle):
+            names.append(service.service_name)
+    return names
+
+
+def _qos_problem(service: Service, theirs: QoSProfile | None) -> str | None:
+    """Return why a server's QoS does not fit the client's, None if it does or is not known."""
+    if theirs is None:
+        return None
+    ours = service.qos or default_qos()
+    problem = incompatibility(ours, theirs) or incompatibility(theirs, ours)
+    return problem and problem.removeprefix("ERROR: ").strip("; ")
+
+
+def _by(servers: Iterable[Endpoint]) -> str:
+    """Return `` by node /a``, `` by nodes /a and /b``, or nothing while no name is known."""
+    names = sorted({server.node for server in servers if server.node})
+    return f" by node{'s' * (len(names) > 1)} {' and '.join(names)}" if names else ""
+
+
+def _discovery_range() -> str:
+    """Return how far the environment lets this process discover others."""
+    if os.environ.get("ROS_LOCALHOST_ONLY") == "1":
+        return "LOCALHOST (ROS_LOCALHOST_ONLY=1)"
+    return (os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE") or "SUBNET").upper()

@@ -7,19 +7,17 @@ from __future__ import annotations
 
 import contextlib
 import platform
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import rclpy
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from rosasync.ros import rcl
-from rosasync.ros.endpoints import incompatibility, request_writers, response_writers
+from rosasync.ros import endpoints, rcl
+from rosasync.ros.endpoints import clients_of, full_name, incompatibility, servers_of
 from rosasync.ros.names import default_qos
 
 __all__ = [
@@ -33,7 +31,6 @@ __all__ = [
     "local_domains",
     "middleware",
     "node_names",
-    "qos_problem",
     "rclpy_location",
     "served_types",
     "server_endpoints",
@@ -58,7 +55,7 @@ class Endpoint:
     Attributes:
         node: the full name of its node, ``""`` while that is unknown.
         srv_type: the name of its service type.
-        reliability: ``"reliable"`` or ``"best_effort"``.
+        reliability: ``"reliable"``, ``"best_effort"`` or ``"unknown"``.
         problem: why its QoS does not match the default of services, None if it does.
     """
 
@@ -70,18 +67,12 @@ class Endpoint:
 
 def server_endpoints(node: Node, srv_name: str) -> list[Endpoint]:
     """Return the servers of a resolved name."""
-    found = response_writers(node, srv_name)
-    if found:
-        return [_endpoint(info, _Role.SERVER) for info in found]
-    return _endpoints_by_node(node, srv_name, node.get_service_names_and_types_by_node)
+    return [_described(server) for server in servers_of(node, srv_name)]
 
 
 def client_endpoints(node: Node, srv_name: str) -> list[Endpoint]:
     """Return the clients of a resolved name, this process's own included."""
-    found = request_writers(node, srv_name)
-    if found:
-        return [_endpoint(info, _Role.CLIENT) for info in found]
-    return _endpoints_by_node(node, srv_name, node.get_client_names_and_types_by_node)
+    return [_described(client) for client in clients_of(node, srv_name)]
 
 
 def services(node: Node) -> dict[str, list[str]]:
@@ -104,7 +95,7 @@ def served_types(node: Node, srv_name: str) -> list[str]:
 def node_names(node: Node) -> list[str]:
     """Return the full names of all nodes, this one included. A name may occur several times."""
     names = node.get_node_names_and_namespaces()
-    return sorted(_full_name(name, namespace) for name, namespace in names)
+    return sorted(full_name(name, namespace) for name, namespace in names)
 
 
 def graph_state(node: Node) -> object:
@@ -164,12 +155,6 @@ def subscribe(
     return lambda: node.destroy_subscription(subscription)
 
 
-def qos_problem(endpoint: TopicEndpointInfo) -> str | None:
-    """Return why an endpoint of a service does not match the default QoS, None if it does."""
-    ours, theirs = default_qos(), endpoint.qos_profile
-    return incompatibility(ours, theirs) or incompatibility(theirs, ours)
-
-
 def middleware() -> str:
     """Return the name of the middleware in use."""
     return str(rclpy.get_rmw_implementation_identifier())
@@ -189,43 +174,18 @@ def bridge_reason() -> str:
     return f"direct, because this is Linux on {platform.machine()} with {middleware()}"
 
 
-class _Role:
-    SERVER, CLIENT = "_Response_", "_Request_"
+def _described(found: endpoints.Endpoint) -> Endpoint:
+    qos = found.qos
+    if qos is None:
+        return Endpoint(found.node, found.srv_type, "unknown", None)
+    reliability = str(qos.reliability.name).lower()
+    return Endpoint(found.node, found.srv_type, reliability, _qos_problem(qos))
 
 
-def _endpoint(info: TopicEndpointInfo, suffix: str) -> Endpoint:
-    return Endpoint(
-        node="" if "UNKNOWN" in info.node_name else _full_name(info.node_name, info.node_namespace),
-        srv_type=_srv_type(info.topic_type, suffix),
-        reliability=str(info.qos_profile.reliability.name).lower(),
-        problem=qos_problem(info),
-    )
-
-
-def _srv_type(topic_type: str, suffix: str) -> str:
-    """Return ``std_srvs/srv/SetBool`` for ``std_srvs::srv::dds_::SetBool_Response_``."""
-    parts = topic_type.removesuffix(suffix).split("::")
-    return "/".join(part for part in parts if part != "dds_")
-
-
-def _endpoints_by_node(node: Node, srv_name: str, query: Callable[..., Any]) -> list[Endpoint]:
-    """Ask each node: for middlewares that name the topics of a service otherwise."""
-    return [
-        Endpoint(_full_name(name, namespace), srv_type, "unknown", None)
-        for name, namespace in node.get_node_names_and_namespaces()
-        for srv_type in _types_of(query, name, namespace, srv_name)
-    ]
-
-
-def _types_of(query: Callable[..., Any], name: str, namespace: str, srv_name: str) -> Iterable[str]:
-    # The node may have left the graph since it was listed.
-    with contextlib.suppress(rclpy_implementation.NodeNameNonExistentError):
-        return list(dict(query(name, namespace)).get(srv_name, ()))
-    return ()
-
-
-def _full_name(name: str, namespace: str) -> str:
-    return f"{namespace.rstrip('/')}/{name}"
+def _qos_problem(qos: QoSProfile) -> str | None:
+    """Return why the QoS of an endpoint does not match the default QoS, None if it does."""
+    ours = default_qos()
+    return incompatibility(ours, qos) or incompatibility(qos, ours)
 
 
 def _participants(node: Node) -> int:

@@ -55,7 +55,10 @@ def resolve_name(node: Node, srv_name: str) -> str:
         raise TypeError(f"a service name must be a str, not {type(srv_name).__name__}")
     if not srv_name.isascii():
         # rclpy's bindings raise a TypeError for what cannot be encoded, such as lone surrogates.
-        raise InvalidServiceName(f"{srv_name!r} is not a valid service name: it is not ASCII")
+        raise InvalidServiceName(
+            f"{srv_name!r} is not a valid service name: it may have letters from a to z, digits, "
+            "underscores, slashes and ~ at its start"
+        )
     try:
         with uses_node(node):
             name = expand_topic_name(srv_name, node.get_name(), node.get_namespace())

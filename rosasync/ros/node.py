@@ -43,6 +43,8 @@ DIRECT_TRIED = ("rmw_fastrtps_cpp", "rmw_fastrtps_dynamic_cpp")
 JOIN_TIMEOUT = 5.0
 """Seconds to wait for the executor thread to finish its current callback."""
 
+CALLBACK_RAISED = "a callback of the node raised an exception; the session goes on"
+
 Bridge = DirectBridge | ExecutorBridge
 
 
@@ -168,6 +170,10 @@ class RosNode:
         """Describe what the graph shows instead of this service, as a clause."""
         return self._graph.explain_missing(service)
 
+    def explain_mismatch(self, service: Service) -> str | None:
+        """Describe the servers of the name as a clause, if all of them have another type."""
+        return self._graph.explain_mismatch(service)
+
     def stop(self) -> None:
         """Ask the executor thread to end. From any thread; idempotent; takes no lock.
 
@@ -231,7 +237,10 @@ class RosNode:
             raise TypeError(f"node must be a name or an rclpy.node.Node, not {kind}")
         context = options.context
         if context is not None and not context.ok():
-            raise UsageError("the context is not initialised, or was shut down: rclpy.init() it")
+            raise UsageError(
+                "the context is not initialised, or was shut down: call "
+                "rclpy.init(context=context) first, or leave it out"
+            )
         try:
             self._own_node = Node(node, context=context) if context else self._make_own(node)
         except InvalidNodeNameException as error:
@@ -266,7 +275,10 @@ class RosNode:
             or (options.bridge == "auto" and not tried)
         ):
             if options.busy_poll:
-                raise UsageError("busy_poll needs the direct bridge, which is not in use here")
+                raise UsageError(
+                    "busy_poll needs the direct bridge, which is not in use here: leave it out, "
+                    "or see `rosasync doctor` for the reason"
+                )
             return ExecutorBridge(self._node, self._gateway, self._introspect)
         return DirectBridge(self._node, librcl, self._loop, self._introspect, options.busy_poll)
 
@@ -311,9 +323,9 @@ class RosNode:
             self._loop.call_soon_threadsafe(self._left.set)
 
     def _post_error(self, error: Exception) -> None:
-        context = {"message": "a callback of the node raised", "exception": error}
+        context = {"message": CALLBACK_RAISED, "exception": error}
         if self._gateway.closed:
-            logger.error("a callback of the node raised", exc_info=error)
+            logger.error(CALLBACK_RAISED, exc_info=error)
         else:
             self._gateway.post_if_open(self._loop.call_exception_handler, context)
 

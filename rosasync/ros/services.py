@@ -38,7 +38,11 @@ def take_request(take: Callable[[Any], Any], request_type: type) -> tuple[Any, A
     try:
         request, header = take(request_type)
     except rclpy_implementation.RCLError as error:
-        logger.error("a request could not be taken: %s", error)
+        logger.error(
+            "a request could not be read and is dropped: compare the versions of the type's "
+            "package on both sides (%s)",
+            error,
+        )
         return None
     return None if header is None else (request, header)
 

@@ -250,6 +250,9 @@ class FakeSession(Session):
         super().__init__("fake", **options)
         self._graph = graph
 
+    async def _load(self) -> None:
+        """Import nothing: a graph in memory needs no rclpy."""
+
     def _open_node(
         self, gateway: LoopGateway, on_graph: Callable[[], None], on_shutdown: Callable[[], None]
     ) -> FakeNode:
@@ -340,7 +343,17 @@ class FakeNode:
 
     def explain_missing(self, service: Service) -> str:
         """List the services in the graph."""
+        if mismatch := self.explain_mismatch(service):
+            return mismatch
         return f"the graph has {sorted(server.srv_name for server in self.graph.servers)}"
+
+    def explain_mismatch(self, service: Service) -> str | None:
+        """Describe the servers of the name as a clause, if all of them have another type."""
+        name, wanted, _ = service.key
+        types = {type_name(s.srv_type) for s in self.graph.servers if s.srv_name == name}
+        if not types or wanted in types:
+            return None
+        return f"this name is served as {' and as '.join(sorted(types))}"
 
     def stop(self) -> None:
         """Do nothing: there is no thread."""

@@ -78,12 +78,16 @@ class GraphSession(Session):
         self._hooks = hooks
         self._fake = fake
 
+    async def _load(self) -> None:
+        # A graph in memory needs no rclpy.
+        if self._fake is None:
+            await super()._load()
+
     def _open_node(
         self, gateway: LoopGateway, on_graph: Callable[[], None], on_shutdown: Callable[[], None]
     ) -> NodePort:
         if self._fake is not None:
             return HookedFakeNode(self._fake, self._hooks, on_graph, on_shutdown)
-        # Only now, because a graph in memory needs no rclpy.
         module = importlib.import_module("rosasync.testing.ros_node")
         node: NodePort = module.HookedRosNode(
             self._options, gateway, on_graph, on_shutdown, self._hooks
