@@ -105,8 +105,8 @@ async def test_the_gripper_ends_cleanly_while_a_motion_is_under_way() -> None:
             pending = session.start(SetBool, GRIPPER, {"data": False})
             await until(lambda: session.pool.statistics().in_flight == 1)
         assert process.returncode == 0
-        (outcome,) = await asyncio.gather(pending, return_exceptions=True)
-        assert isinstance(outcome, ServerGone | SetBool.Response)
+        outcomes = await asyncio.gather(pending, return_exceptions=True)
+        assert isinstance(outcomes[0], ServerGone | SetBool.Response)
 
 
 def test_the_dashboard_of_a_stock_node(stock: ServerProcess) -> None:

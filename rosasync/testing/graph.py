@@ -15,6 +15,8 @@ from __future__ import annotations
 import asyncio
 import itertools
 import logging
+import re
+import time
 from collections import deque
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -39,6 +41,9 @@ __all__ = [
 ]
 
 logger = logging.getLogger("rosasync")
+
+NAME = re.compile(r"/?[a-z_]\w*(/[a-z_]\w*)*", re.ASCII | re.IGNORECASE)
+"""A name that ROS allows."""
 
 
 @dataclass(eq=False)
@@ -100,8 +105,8 @@ class FakeHeader:
 
     client: FakeClient
     sequence_number: int
-    source_timestamp: int = 0
-    received_timestamp: int = 0
+    source_timestamp: int
+    received_timestamp: int
 
     @property
     def request_id(self) -> FakeHeader:
@@ -164,7 +169,8 @@ class FakeService(FakeServer):
         while self._queue:
             client, number, request = self._queue.popleft()
             self.received.append(request)
-            self._loop.call_soon(self._arrived, request, FakeHeader(client, number))
+            header = FakeHeader(client, number, time.time_ns(), time.time_ns())
+            self._loop.call_soon(self._arrived, request, header)
 
     def _arrived(self, request: Any, header: FakeHeader) -> None:
         if not self._stopped:
@@ -302,11 +308,13 @@ class FakeNode:
         return request_message(srv_type, request)
 
     def _resolve(self, srv_name: str) -> str:
-        """Return the name with a leading slash."""
-        name = srv_name if srv_name.startswith("/") else f"/{srv_name}"
-        if not all(part.isidentifier() for part in name[1:].split("/")):
+        """Return the name with a leading slash, that of a private name after the node's."""
+        if not isinstance(srv_name, str):
+            raise TypeError(f"a service name must be a str, not {type(srv_name).__name__}")
+        name = f"{self.name}/{srv_name[2:]}" if srv_name.startswith("~/") else srv_name
+        if NAME.fullmatch(name) is None:
             raise InvalidServiceName(f"{srv_name!r} is not a valid service name")
-        return name
+        return name if name.startswith("/") else f"/{name}"
 
     def open_client(self, service: Service, deliver: Deliver) -> FakeClient:
         """Create a client that passes its responses to ``deliver``."""
@@ -339,8 +347,9 @@ class FakeNode:
         return frozenset(map(id, self.graph.find(service.key.srv_type, service.key.srv_name)))
 
     def explain_missing(self, service: Service) -> str:
-        """List the services in the graph."""
-        return f"the graph has {sorted(server.srv_name for server in self.graph.servers)}"
+        """List the services in the graph, with their types."""
+        services = {f"{each.srv_name} ({type_name(each.srv_type)})" for each in self.graph.servers}
+        return f"the graph has {', '.join(sorted(services)) or 'no service'}"
 
     def stop(self) -> None:
         """Do nothing: there is no thread."""
@@ -378,14 +387,14 @@ class FakeClient:
         self._numbers = itertools.count(1)
 
     def send(self, request: Any) -> int:
-        """Send a request to every server of the name."""
+        """Send a copy of a request to every server of the name."""
         number = next(self._numbers)
         self.sent.append(number)
         self.out.add(number)
         self.most = max(self.most, len(self.out))
         if not self.node.graph.dropping_requests:
             for server in self.node.graph.find(self.srv_type, self.srv_name):
-                server.receive(self, number, request)
+                server.receive(self, number, deepcopy(request))
         return number
 
     def later(self, delay: float, number: int, response: Any) -> None:
