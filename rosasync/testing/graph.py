@@ -164,6 +164,10 @@ class FakeService(FakeServer):
         """Stop delivering requests; idempotent."""
         self._stopped = True
 
+    def receive(self, client: FakeClient, number: int, request: Any) -> None:
+        """Queue a copy of a request, or lose it if the queue is full."""
+        super().receive(client, number, deepcopy(request))
+
     def handle_queued(self) -> None:
         """Deliver the queued requests to the session, in the next turn of its loop."""
         while self._queue:
@@ -387,14 +391,14 @@ class FakeClient:
         self._numbers = itertools.count(1)
 
     def send(self, request: Any) -> int:
-        """Send a copy of a request to every server of the name."""
+        """Send a request to every server of the name."""
         number = next(self._numbers)
         self.sent.append(number)
         self.out.add(number)
         self.most = max(self.most, len(self.out))
         if not self.node.graph.dropping_requests:
             for server in self.node.graph.find(self.srv_type, self.srv_name):
-                server.receive(self, number, deepcopy(request))
+                server.receive(self, number, request)
         return number
 
     def later(self, delay: float, number: int, response: Any) -> None:
