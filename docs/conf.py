@@ -25,7 +25,7 @@ extensions = [
     "sphinx.ext.napoleon",
     "sphinx_copybutton",
 ]
-exclude_patterns = ["examples", "site"]
+exclude_patterns = ["site"]
 
 html_theme = "furo"
 html_title = "rosasync"

@@ -10,11 +10,14 @@ import importlib
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from textwrap import indent
 from typing import Any
 
 import pytest
@@ -24,9 +27,12 @@ from sybil.parsers.markdown import CodeBlockParser
 import rosasync
 from rosasync.ros.domain import isolate
 from tests.support.process import ROOT, profile
+from tests.support.project import python_path
+from tests.support.servers import running
 from tests.support.times import LIMIT
 
 DOCS = ROOT / "docs"
+EXAMPLES = DOCS / "examples"
 NAME = re.compile(r"# (\S+\.py)\n")
 SERVERS = {"lamp.py": DOCS / "tutorial.md", "robot.py": DOCS / "how-to" / "ticks.md"}
 """The programs that more than one page runs, and the page that shows them."""
@@ -47,8 +53,16 @@ def pages() -> list[Path]:
     return [*sorted(found), ROOT / "README.md"]
 
 
+def name_of(page: Path) -> str:
+    """Return the name of a page, or that of its folder."""
+    return page.parent.name if page.stem == "README" else page.stem
+
+
 class Reader:
-    """Follows one page in an empty folder: saves its programs and runs its commands."""
+    """Follows one page in a folder: saves its programs and runs its commands.
+
+    The folder is empty, or that of an example.
+    """
 
     def __init__(self, folder: Path, servers: Servers) -> None:
         self.folder = folder
@@ -76,13 +90,16 @@ class Reader:
             words, _, remark = command.partition("  # ")
             program = words.removeprefix("python ")
             if not program.endswith(".py"):
-                shell(words, self.folder)
+                printed = shell(words, self.folder)
+                assert matches(printed, expected), f"{command} printed:\n{printed}"
                 continue
             self.run_programs.add(program)
             if program in SERVERS:
                 self.environment = self.servers.start(program)
             elif "second terminal" in remark:
-                self.background.enter_context(until_terminated(self.folder / program, expected))
+                path = self.folder / program
+                server = until_terminated(path, expected) if expected else running(path)
+                self.background.enter_context(server)
             else:
                 printed = run(self.folder / program, self.environment)
                 if order := re.search(r"lines (\d+) to (\d+) in any order", remark):
@@ -149,17 +166,21 @@ def until_terminated(program: Path, expected: str) -> Iterator[None]:
     assert process.returncode == 0
 
 
-def shell(command: str, folder: Path) -> None:
+def shell(command: str, folder: Path) -> str:
     """Run any other command of a page, with the folder as home, and the commands of this Python."""
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     rosasync_command = f'rosasync() {{ "{sys.executable}" -m rosasync "$@"; }}; '
-    subprocess.run(
-        ("bash", "-c", rosasync_command + command),
-        cwd=folder,
-        env=os.environ | {"HOME": str(folder), "PATH": path},
-        timeout=120,
-        check=True,
-    )
+    with TemporaryDirectory() as site:
+        variables = {"HOME": str(folder), "PATH": path, "PYTHONPATH": python_path(Path(site))}
+        return subprocess.run(
+            ("bash", "-c", rosasync_command + command),
+            cwd=folder,
+            env=os.environ | variables,
+            stdout=subprocess.PIPE,
+            text=True,
+            timeout=120,
+            check=False,
+        ).stdout
 
 
 def run(program: Path, environment: Mapping[str, str]) -> str:
@@ -217,8 +238,10 @@ def servers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Servers]:
     servers.close()
 
 
-@pytest.mark.parametrize("page", pages(), ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", pages(), ids=name_of)
 def test_the_page_works_as_written(page: Path, tmp_path: Path, servers: Servers) -> None:
+    if EXAMPLES in page.parents:
+        shutil.copytree(page.parent, tmp_path, dirs_exist_ok=True)
     reader = Reader(tmp_path, servers)
     reader.follow(page)
     imported = {
@@ -230,9 +253,7 @@ def test_the_page_works_as_written(page: Path, tmp_path: Path, servers: Servers)
     assert {name.removesuffix(".py") for name in not_run} <= imported
 
 
-@pytest.mark.parametrize(
-    "page", [*sorted(DOCS.rglob("*.md")), ROOT / "README.md"], ids=lambda page: page.stem
-)
+@pytest.mark.parametrize("page", [*sorted(DOCS.rglob("*.md")), ROOT / "README.md"], ids=name_of)
 def test_every_fragment_compiles_and_its_names_exist(page: Path) -> None:
     for code in python_blocks(page):
         tree = compile(code, str(page), "exec", ast.PyCF_ONLY_AST | ast.PyCF_ALLOW_TOP_LEVEL_AWAIT)
@@ -252,6 +273,17 @@ def has(owner: Any, name: str) -> bool:
     return hasattr(owner, name) or (
         owner is rosasync and (Path(str(rosasync.__file__)).parent / f"{name}.py").exists()
     )
+
+
+@pytest.mark.parametrize("page", sorted(EXAMPLES.glob("*/README.md")), ids=name_of)
+def test_the_page_of_an_example_quotes_and_links_its_files(page: Path) -> None:
+    programs = {path.name: path.read_text() for path in page.parent.glob("*.py")}
+    for code in python_blocks(page):
+        quotes = {indent(code, depth * "    ") for depth in range(3)}
+        assert any(quote in program for program in programs.values() for quote in quotes), code
+    text = page.read_text()
+    assert not [name for name in programs if f"[{name}]({name})" not in text]
+    assert page.parent.name in (EXAMPLES / "index.md").read_text()
 
 
 def test_the_commands_of_the_readme_are_the_ones_that_are_checked() -> None:

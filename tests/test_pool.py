@@ -273,7 +273,7 @@ async def test_the_poller_serves_where_graph_events_do_not(events: bool) -> None
 async def test_unavailable_says_what_was_seen(fake_graph: FakeGraph) -> None:
     fake_graph.serve(Echo, "/echoes", echo)
     async with opened(fake_graph) as session:
-        with pytest.raises(ServiceUnavailable, match=r"/echo: .*\['/echoes'\]") as caught:
+        with pytest.raises(ServiceUnavailable, match=r"/echo: .* has /echoes \(") as caught:
             await ask(session, 1, timeout=TICK)
         assert caught.value.srv_name == "/echo"
         assert caught.value.elapsed > 0

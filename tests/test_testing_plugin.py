@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.process import ROOT
-
-PLUGIN = "rosasync.testing.plugin"
+from tests.support.project import PLUGIN, python_path
 
 STRICT = """
 import pytest
@@ -35,21 +34,15 @@ async def test_lenient(ros_graph):
 
 @pytest.fixture
 def project(tmp_path: Path) -> Path:
-    """A project that has rosasync installed: its metadata is there, and nothing else."""
-    info = tmp_path / "site" / "rosasync-0.1.0.dist-info"
-    info.mkdir(parents=True)
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: rosasync\nVersion: 0.1.0\n")
-    (info / "entry_points.txt").write_text(f"[pytest11]\n{PLUGIN} = {PLUGIN}\n")
     (tmp_path / "pytest.ini").write_text("[pytest]\nasyncio_mode = auto\naddopts = -ra\n")
     return tmp_path
 
 
 def run(project: Path, *arguments: str) -> str:
-    path = os.pathsep.join([str(project / "site"), str(ROOT)])
     return subprocess.run(
         [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *arguments],
         cwd=project,
-        env=os.environ | {"PYTHONPATH": path},
+        env=os.environ | {"PYTHONPATH": python_path(project / "site")},
         stdout=subprocess.PIPE,
         text=True,
         check=False,

@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from rcl_interfaces.srv import GetParameters
 from std_srvs.srv import SetBool, Trigger
 
 from rosasync import (
     AsyncServiceProxy,
+    InvalidServiceName,
     ResponseTimeout,
     Retry,
     ServerGone,
     ServiceUnavailable,
     Session,
     SessionClosed,
+    UsageError,
 )
+from rosasync.parameters import ParameterClient
 from rosasync.testing import Graph, Recording, VirtualClock
 from tests.support.times import LIMIT, TICK, until
 
@@ -214,6 +219,176 @@ class TestFaults:
         assert (await switch(session)).success
         other.assert_called(times=1)
 
+    async def test_they_combine(self, lamp: Any, session: Session) -> None:
+        with lamp.delay_responses(2 * TICK), lamp.duplicate_responses():
+            assert (await switch(session)).success
+            await until(lambda: session.pool.statistics().late == 1)
+        with lamp.drop_requests(), lamp.hold_responses(), pytest.raises(ResponseTimeout):
+            await switch(session, timeout=4 * TICK)
+        assert session.pool.statistics().late == 1
+
+    async def test_they_end_with_their_block(self, lamp: Any, session: Session) -> None:
+        blocks = [lamp.delay_responses(LIMIT), lamp.drop_requests(), lamp.drop_responses()]
+        for block in [*blocks, lamp.hold_responses(), lamp.duplicate_responses()]:
+            with pytest.raises(ZeroDivisionError), block:
+                raise ZeroDivisionError
+        assert (await switch(session)).success
+        assert session.pool.statistics().late == 0
+
+    @pytest.mark.parametrize("fault", ["delay_responses", "drop_responses", "hold_responses"])
+    async def test_a_crash_before_the_response(
+        self, lamp: Any, session: Session, fault: str
+    ) -> None:
+        seconds = [LIMIT] if fault == "delay_responses" else []
+        with getattr(lamp, fault)(*seconds):
+            call = session.start(SetBool, LAMP, {"data": True})
+            await lamp.wait_for_calls(1, timeout=LIMIT)
+            await lamp.vanish()
+            await lamp.vanish()
+            with pytest.raises(ServerGone):
+                await call
+        assert repr(lamp) == f"<StubServer {LAMP} vanished, 1 call>"
+        lamp.come_back()
+        assert (await switch(session)).success
+        assert repr(lamp) == f"<StubServer {LAMP} up, 2 calls>"
+
+    async def test_a_crash_while_the_handler_runs(
+        self, ros_graph: Graph, lamp: Any, session: Session
+    ) -> None:
+        cancelled = []
+
+        async def endless(request: Any, response: Any) -> Any:
+            try:
+                await asyncio.Event().wait()
+            except asyncio.CancelledError:
+                cancelled.append(request.data)
+                raise
+
+        other = ros_graph.serve(SetBool, "/suite/endless", endless)
+        call = session.start(SetBool, "/suite/endless", {"data": True})
+        await other.wait_for_calls(1, timeout=LIMIT)
+        await other.vanish()
+        with pytest.raises(ServerGone):
+            await call
+        assert cancelled == [True]
+        assert (await switch(session)).success
+
+    async def test_a_retry_after_a_crash(self, lamp: Any, session: Session) -> None:
+        with lamp.drop_responses():
+            call = session.start(SetBool, LAMP, {"data": True}, retry=Retry(after=LIMIT))
+            await lamp.wait_for_calls(1, timeout=LIMIT)
+            await lamp.vanish()
+            await until(lambda: not session.service_is_ready(SetBool, LAMP))
+        lamp.come_back()
+        assert (await call).success
+        lamp.assert_called(times=2)
+
+
+class TestMessages:
+    async def test_each_side_has_its_own(self, ros_graph: Graph, session: Session) -> None:
+        kept = SetBool.Response(message="before")
+
+        def change(request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+            request.data = False
+            return kept
+
+        lamp = ros_graph.serve(SetBool, LAMP, change)
+        request = SetBool.Request(data=True)
+        response = await session.call(SetBool, LAMP, request)
+        kept.message = "after"
+        assert request.data
+        assert response.message == "before"
+        assert lamp.requests == [{"data": True}]
+        assert lamp.calls[0].response.message == "before"
+
+    async def test_what_the_middleware_reports(self, ros_graph: Graph, session: Session) -> None:
+        infos = []
+
+        def look(call: Any) -> SetBool.Response:
+            infos.append(call.info)
+            return call.response
+
+        ros_graph.serve(SetBool, LAMP, look)
+        before = time.time_ns()
+        await switch(session)
+        await switch(session)
+        assert infos[0].sequence_number < infos[1].sequence_number
+        for info in infos:
+            assert before <= info.source_timestamp <= info.received_timestamp <= time.time_ns()
+
+    async def test_the_wrong_kind_is_refused(self, ros_graph: Graph, session: Session) -> None:
+        ros_graph.stub(SetBool, LAMP, optional=True)
+        for request in (Trigger.Request(), {"data": 1}, 3):
+            with pytest.raises(TypeError):
+                await session.call(SetBool, LAMP, request)
+        with pytest.raises(ValueError, match="date"):
+            await session.call(SetBool, LAMP, {"date": True})
+
+
+class TestNames:
+    @pytest.mark.parametrize("name", ["suite/lamp", LAMP])
+    async def test_relative_and_absolute(
+        self, ros_graph: Graph, session: Session, name: str
+    ) -> None:
+        lamp = ros_graph.stub(SetBool, name, {"success": True})
+        assert lamp.srv_name == LAMP
+        assert (await switch(session)).success
+        assert (await session.call(SetBool, name)).success
+
+    async def test_private(self, ros_graph: Graph) -> None:
+        ros_graph.stub(SetBool, "/suite_node/lamp", {"success": True})
+        async with ros_graph.session("suite_node", timeout=2 * LIMIT) as session:
+            assert (await session.call(SetBool, "~/lamp")).success
+
+    @pytest.mark.parametrize("name", ["", "/", "a b", "1a", "a//b", "/a/", "a-b", "ä"])
+    async def test_what_ros_does_not_allow(
+        self, ros_graph: Graph, session: Session, name: str
+    ) -> None:
+        with pytest.raises(InvalidServiceName):
+            await session.call(SetBool, name)
+        with pytest.raises(InvalidServiceName):
+            ros_graph.stub(SetBool, name)
+        assert ros_graph.servers == []
+
+    async def test_what_is_no_name(self, session: Session) -> None:
+        name: Any = 3
+        with pytest.raises(TypeError, match="must be a str"):
+            await session.call(SetBool, name)
+
+
+class TestSeveralServers:
+    async def test_of_one_name(self, ros_graph: Graph, session: Session) -> None:
+        lamps = [ros_graph.stub(SetBool, LAMP, {"success": True}) for _ in range(2)]
+        await until(lambda: session.service_is_ready(SetBool, LAMP))
+        async with session.pool.lease(SetBool, LAMP) as client:
+            while not all(lamp.calls for lamp in lamps):
+                assert (await client.call({"data": True})).success
+        await lamps[0].vanish()
+        assert (await switch(session, False)).success
+        assert lamps[1].requests[-1] == {"data": False}
+
+    async def test_of_another_type(self, ros_graph: Graph, session: Session) -> None:
+        ros_graph.stub(Trigger, LAMP, optional=True)
+        # The middleware allows one type for each name in a process.
+        error = UsageError if ros_graph.kind == "real" else ServiceUnavailable
+        with pytest.raises(error, match=r"lamp.* type|lamp \(std_srvs/srv/Trigger\)"):
+            await switch(session, timeout=TICK)
+
+    async def test_a_hundred_calls_at_once(self, ros_graph: Graph, session: Session) -> None:
+        lamp = ros_graph.serve(SetBool, LAMP, asynchronous)
+        wanted = [number % 3 == 0 for number in range(100)]
+        answers = await asyncio.gather(*(switch(session, on) for on in wanted))
+        assert [answer.success for answer in answers] == wanted
+        lamp.assert_called(times=100)
+
+
+async def test_parameters_of_a_stub(ros_graph: Graph, session: Session) -> None:
+    value = {"type": 3, "double_value": 0.5}
+    get = ros_graph.stub(GetParameters, "/suite_arm/get_parameters", {"values": [value]})
+    arm = ParameterClient(session, "/suite_arm", timeout=LIMIT)
+    assert await arm.get("speed") == 0.5
+    get.assert_requests({"names": ["speed"]})
+
 
 class TestProxiesAndThreads:
     async def test_a_proxy(self, ros_graph: Graph, session: Session) -> None:
@@ -295,6 +470,23 @@ class TestStrictness:
             ros_graph.check()
         assert str(failure.value).splitlines()[1:] == [f"{LAMP} was never called"]
         ros_graph.strict = False
+
+    async def test_a_lost_request_is_a_call(self, ros_graph: Graph, session: Session) -> None:
+        lamp = ros_graph.stub(SetBool, LAMP, {})
+        await session.wait_for_service(SetBool, LAMP, timeout=LIMIT)
+        with lamp.drop_requests(), pytest.raises(ResponseTimeout):
+            await switch(session, timeout=4 * TICK)
+        assert lamp.lost_requests == 1
+        with pytest.raises(AssertionError, match=r"no request \(1 request lost on the way\)"):
+            lamp.assert_called()
+        ros_graph.check()
+
+    async def test_a_server_that_comes_later(self, ros_graph: Graph, session: Session) -> None:
+        call = session.start(SetBool, LAMP, {"data": True})
+        await asyncio.sleep(4 * TICK)
+        ros_graph.stub(SetBool, LAMP, {"success": True})
+        assert (await call).success
+        ros_graph.check()
 
     async def test_a_request_without_an_answer(self, ros_graph: Graph, session: Session) -> None:
         ros_graph.stub(SetBool, LAMP).answer({}, match={"data": False})

@@ -105,14 +105,8 @@ class _LoopTime:
         self._skipped = 0.0
         self._numbers = itertools.count()
         self._timers: list[tuple[float, int, asyncio.TimerHandle]] = []
-        try:
-            loop.time = self.time  # type: ignore[method-assign]
-            loop.call_at = self.call_at  # type: ignore[assignment, method-assign]
-        except AttributeError:
-            raise TypeError(
-                f"the time of {type(loop).__module__}.{type(loop).__name__} cannot be changed: "
-                "run tests that use VirtualClock on asyncio's own loop"
-            ) from None
+        loop.time = self.time  # type: ignore[method-assign]
+        loop.call_at = self.call_at  # type: ignore[assignment, method-assign]
 
     def time(self) -> float:
         return self._real_time() + self._skipped
@@ -145,5 +139,11 @@ class _LoopTime:
 def _installed() -> _LoopTime:
     """Return the time of the running loop, and install it if this is the first use."""
     loop = asyncio.get_running_loop()
+    # The timers of other loops, such as uvloop's, do not ask for the loop's time.
+    if not isinstance(loop, asyncio.BaseEventLoop):
+        raise TypeError(
+            f"the time of {type(loop).__module__}.{type(loop).__name__} cannot be changed: "
+            "run tests that use VirtualClock on asyncio's own loop"
+        )
     installed = getattr(loop.time, "__self__", None)
     return installed if isinstance(installed, _LoopTime) else _LoopTime(loop)

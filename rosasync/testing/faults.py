@@ -46,6 +46,7 @@ class Faults:
         duplicating: whether responses are sent twice.
         holding: whether responses are held back.
         held: sends the responses that were held back.
+        lost_requests: the number of requests that were lost.
     """
 
     delay: float = 0.0
@@ -54,6 +55,7 @@ class Faults:
     duplicating: bool = False
     holding: bool = False
     held: list[Callable[[], None]] = field(default_factory=list)
+    lost_requests: int = 0
 
     def release(self) -> None:
         """Send the responses that were held back."""
@@ -159,6 +161,7 @@ class FaultyService:
 
     def _arrived(self, request: Any, header: RequestHeader) -> None:
         if self._faults.dropping_requests:
+            self._faults.lost_requests += 1
             return
         call = StubCall(deepcopy(request))
         self._calls[id(header)] = header, call

@@ -15,6 +15,8 @@ from __future__ import annotations
 import asyncio
 import itertools
 import logging
+import re
+import time
 from collections import deque
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -39,6 +41,9 @@ __all__ = [
 ]
 
 logger = logging.getLogger("rosasync")
+
+NAME = re.compile(r"/?[a-z_]\w*(/[a-z_]\w*)*", re.ASCII | re.IGNORECASE)
+"""A name that ROS allows."""
 
 
 @dataclass(eq=False)
@@ -100,8 +105,8 @@ class FakeHeader:
 
     client: FakeClient
     sequence_number: int
-    source_timestamp: int = 0
-    received_timestamp: int = 0
+    source_timestamp: int
+    received_timestamp: int
 
     @property
     def request_id(self) -> FakeHeader:
@@ -159,12 +164,17 @@ class FakeService(FakeServer):
         """Stop delivering requests; idempotent."""
         self._stopped = True
 
+    def receive(self, client: FakeClient, number: int, request: Any) -> None:
+        """Queue a copy of a request, or lose it if the queue is full."""
+        super().receive(client, number, deepcopy(request))
+
     def handle_queued(self) -> None:
         """Deliver the queued requests to the session, in the next turn of its loop."""
         while self._queue:
             client, number, request = self._queue.popleft()
             self.received.append(request)
-            self._loop.call_soon(self._arrived, request, FakeHeader(client, number))
+            header = FakeHeader(client, number, time.time_ns(), time.time_ns())
+            self._loop.call_soon(self._arrived, request, header)
 
     def _arrived(self, request: Any, header: FakeHeader) -> None:
         if not self._stopped:
@@ -305,11 +315,13 @@ class FakeNode:
         return request_message(srv_type, request)
 
     def _resolve(self, srv_name: str) -> str:
-        """Return the name with a leading slash."""
-        name = srv_name if srv_name.startswith("/") else f"/{srv_name}"
-        if not all(part.isidentifier() for part in name[1:].split("/")):
+        """Return the name with a leading slash, that of a private name after the node's."""
+        if not isinstance(srv_name, str):
+            raise TypeError(f"a service name must be a str, not {type(srv_name).__name__}")
+        name = f"{self.name}/{srv_name[2:]}" if srv_name.startswith("~/") else srv_name
+        if NAME.fullmatch(name) is None:
             raise InvalidServiceName(f"{srv_name!r} is not a valid service name")
-        return name
+        return name if name.startswith("/") else f"/{name}"
 
     def open_client(self, service: Service, deliver: Deliver) -> FakeClient:
         """Create a client that passes its responses to ``deliver``."""
@@ -342,10 +354,11 @@ class FakeNode:
         return frozenset(map(id, self.graph.find(service.key.srv_type, service.key.srv_name)))
 
     def explain_missing(self, service: Service) -> str:
-        """List the services in the graph."""
+        """List the services in the graph, with their types."""
         if mismatch := self.explain_mismatch(service):
             return mismatch
-        return f"the graph has {sorted(server.srv_name for server in self.graph.servers)}"
+        services = {f"{each.srv_name} ({type_name(each.srv_type)})" for each in self.graph.servers}
+        return f"the graph has {', '.join(sorted(services)) or 'no service'}"
 
     def explain_mismatch(self, service: Service) -> str | None:
         """Describe the servers of the name as a clause, if all of them have another type."""

@@ -87,7 +87,9 @@ class GraphSession(Session):
         self, gateway: LoopGateway, on_graph: Callable[[], None], on_shutdown: Callable[[], None]
     ) -> NodePort:
         if self._fake is not None:
-            return HookedFakeNode(self._fake, self._hooks, on_graph, on_shutdown)
+            name = str(self._options.node)
+            return HookedFakeNode(self._fake, self._hooks, name, on_graph, on_shutdown)
+        # Only now, because a graph in memory needs no rclpy.
         module = importlib.import_module("rosasync.testing.ros_node")
         node: NodePort = module.HookedRosNode(
             self._options, gateway, on_graph, on_shutdown, self._hooks
@@ -102,10 +104,12 @@ class HookedFakeNode(FakeNode):
         self,
         graph: FakeGraph,
         hooks: Hooks,
+        name: str,
         on_graph: Callable[[], None],
         on_shutdown: Callable[[], None],
     ) -> None:
         super().__init__(graph, on_graph, on_shutdown)
+        self.name = name
         self._hooks = hooks
 
     def open_client(self, service: Service, deliver: Deliver) -> Any:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pprint import pformat
 from typing import Any
 
-from rosasync.ros.messages import to_dict, type_name
+from rosasync.ros.messages import field_types, type_name
 
 __all__ = ["check_fields", "count", "describe", "difference", "matches"]
 
@@ -18,29 +18,38 @@ def matches(expected: Any, actual: Any) -> bool:
         return isinstance(actual, Mapping) and all(
             name in actual and matches(value, actual[name]) for name, value in expected.items()
         )
-    return bool(expected == actual)
+    if isinstance(expected, list | tuple) and isinstance(actual, list):
+        return len(expected) == len(actual) and all(map(matches, expected, actual))
+    # Only NaN differs from itself.
+    return bool(expected == actual or (expected != expected and actual != actual))
 
 
 def check_fields(message_type: type[Any], fields: Mapping[str, Any]) -> None:
-    """Check the names of the fields that a test expects.
+    """Check the names of the fields that a test expects, also those of nested messages.
 
     Raises:
         ValueError: the message has no such field.
     """
-    known = to_dict(message_type())
-    for name in fields:
+    known = field_types(message_type)
+    for name, value in fields.items():
         if name not in known:
             raise ValueError(
                 f"{type_name(message_type)} has no field {name!r}; it has {', '.join(known)}"
             )
+        field = known[name].element or known[name]
+        if field.message_type is not None:
+            for nested in value if isinstance(value, list | tuple) else [value]:
+                if isinstance(nested, Mapping):
+                    check_fields(field.message_type, nested)
 
 
-def describe(requests: Sequence[Mapping[str, Any]]) -> str:
-    """List requests, one in a line."""
+def describe(requests: Sequence[Mapping[str, Any]], lost: int = 0) -> str:
+    """List requests, one in a line, and say how many further ones were lost."""
+    further = f" ({count(lost, 'request')} lost on the way)" if lost else ""
     if not requests:
-        return "it received no request"
+        return f"it received no request{further}"
     lines = [f"  {number}. {fields}" for number, fields in enumerate(requests, 1)]
-    return "\n".join([f"it received {count(len(requests), 'request')}:", *lines])
+    return "\n".join([f"it received {count(len(requests), 'request')}{further}:", *lines])
 
 
 def difference(expected: Any, actual: Any) -> str:

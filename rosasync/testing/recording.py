@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import AsyncIterator, Iterable
-from contextlib import asynccontextmanager
+from collections import defaultdict
+from collections.abc import AsyncIterator, Callable, Iterable
+from contextlib import ExitStack, asynccontextmanager
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -24,10 +26,10 @@ logger = logging.getLogger("rosasync")
 
 FORMAT = 1
 """The version of the files."""
-HISTORY = 1000
-"""How many introspection events may wait to be recorded."""
 REQUESTS = (0, 1)
 """The ``event_type`` of events that carry requests: sent, received."""
+PREFIX = 12
+"""Bytes of an RTPS id that identify the participant."""
 
 
 @dataclass
@@ -90,23 +92,19 @@ class Recording:
             session: an open session on real ROS.
             services: the type and the name of each service.
         """
+        # Only now, because a graph in memory needs no rclpy.
+        from rosasync.ros.inspect import subscribe
+
         loop = asyncio.get_running_loop()
         node = session.node
-        subscriptions = []
-        for srv_type, srv_name in services:
-            kind = service_type(srv_type)
-            listener = _Listener(self, type_name(kind), node.resolve_service_name(srv_name))
-
-            def post(event: Any, listener: _Listener = listener) -> None:
-                loop.call_soon_threadsafe(listener.take, event)
-
-            topic = f"{listener.srv_name}/_service_event"
-            subscriptions.append(node.create_subscription(kind.Event, topic, post, HISTORY))
-        try:
+        with ExitStack() as subscriptions:
+            for srv_type, srv_name in services:
+                kind = service_type(srv_type)
+                listener = _Listener(self, type_name(kind), node.resolve_service_name(srv_name))
+                topic = f"{listener.srv_name}/_service_event"
+                post = partial(_post, loop, listener.take)
+                subscriptions.callback(subscribe(node, kind.Event, topic, post))
             yield self
-        finally:
-            for subscription in subscriptions:
-                node.destroy_subscription(subscription)
 
     def wrap_client(self, opener: OpenClient, service: Service, deliver: Deliver) -> ClientPort:
         """Open a client that records its calls."""
@@ -141,7 +139,15 @@ class Recording:
         content = yaml.safe_load(Path(path).read_text())
         if not isinstance(content, dict) or content.get("rosasync-recording") != FORMAT:
             raise ValueError(f"{path} is not a recording of format {FORMAT}")
-        return cls([_checked(path, entry) for entry in content.get("calls") or ()])
+        calls = content.get("calls") or []
+        if not isinstance(calls, list):
+            raise ValueError(f"{path}: {calls!r} is not a list of calls")
+        return cls(_checked(path, entry) for entry in calls)
+
+
+def _post(loop: asyncio.AbstractEventLoop, take: Callable[[Any], None], event: Any) -> None:
+    """Pass an event from the executor's thread to the loop's."""
+    loop.call_soon_threadsafe(take, event)
 
 
 def _checked(path: str | Path, entry: Any) -> RecordedCall:
@@ -207,6 +213,10 @@ class _Listener:
         self._srv_type = srv_type
         self._recording = recording
         self._calls: dict[tuple[bytes, int], RecordedCall] = {}
+        # By participant and sequence number: calls that one side has reported, and how it calls
+        # the client.
+        self._one_sided: defaultdict[tuple[bytes, int], list[tuple[int, RecordedCall]]]
+        self._one_sided = defaultdict(list)
         # Whether the warning about events without contents was logged.
         self._warned = False
 
@@ -217,14 +227,38 @@ class _Listener:
             self._warn()
             return
         key = bytes(bytearray(event.info.client_gid)), int(event.info.sequence_number)
+        fields = to_dict(contents[0])
         call = self._calls.get(key)
         if event.info.event_type in REQUESTS:
             if call is None:
-                call = RecordedCall(self.srv_name, self._srv_type, to_dict(contents[0]))
-                self._calls[key] = call
-                self._recording.calls.append(call)
+                self._calls[key] = self._reported_before(key, fields) or self._add(key, fields)
         elif call is not None and call.response is None:
-            call.response = to_dict(contents[0])
+            call.response = fields
+
+    def _add(self, key: tuple[bytes, int], request: dict[str, Any]) -> RecordedCall:
+        client, number = key
+        call = RecordedCall(self.srv_name, self._srv_type, request)
+        self._one_sided[client[:PREFIX], number].append((client[-1], call))
+        self._recording.calls.append(call)
+        return call
+
+    def _reported_before(
+        self, key: tuple[bytes, int], request: dict[str, Any]
+    ) -> RecordedCall | None:
+        """Return the call if the other side has reported it under another id of the client.
+
+        On Jazzy, the client gives the id of its request writer, the server that of the client's
+        response reader. They have the participant in common, and differ in the kind of the entity,
+        the last byte.
+        """
+        client, number = key
+        reported = self._one_sided[client[:PREFIX], number]
+        for entry in reported:
+            kind, call = entry
+            if kind != client[-1] and call.request == request:
+                reported.remove(entry)
+                return call
+        return None
 
     def _warn(self) -> None:
         if not self._warned:

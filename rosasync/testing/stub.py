@@ -106,6 +106,11 @@ class StubServer:
         """The fields of the requests received, in order, as plain values to compare."""
         return [to_dict(call.request) for call in self.calls]
 
+    @property
+    def lost_requests(self) -> int:
+        """The number of requests that `drop_requests` lost, which are not in `calls`."""
+        return self._faults.lost_requests
+
     # Answers.
 
     def answer(self, *answers: Answer, match: Match = None) -> Self:
@@ -277,7 +282,8 @@ class StubServer:
             )
 
     def _failure(self, expected: str, more: str = "") -> AssertionError:
-        return AssertionError(f"{self.srv_name}: {expected}, but {describe(self.requests)}{more}")
+        received = describe(self.requests, self.lost_requests)
+        return AssertionError(f"{self.srv_name}: {expected}, but {received}{more}")
 
     # Serving.
 
