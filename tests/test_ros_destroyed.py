@@ -115,6 +115,24 @@ async def test_a_client_that_the_program_destroys(bridge: Bridge, echo: str) -> 
     assert reported == []
 
 
+async def test_a_service_that_is_destroyed_as_soon_as_it_is_created(
+    bridge: Bridge, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As by a thread that shuts the context down, on Kilted: rclpy crashes if its QoS is read."""
+    with borrowed_node() as node:
+        async with open_node(bridge, node) as opened:
+            create = node.create_service
+
+            def create_and_destroy(*args: Any, **options: Any) -> Any:
+                service = create(*args, **options)
+                node.destroy_service(service)
+                return service
+
+            monkeypatch.setattr(node, "create_service", create_and_destroy)
+            with pytest.raises(RosasyncError, match="destruction was requested"):
+                opened.serve()
+
+
 async def test_a_service_that_the_program_destroys(bridge: Bridge) -> None:
     with reports() as reported:
         async with open_node(bridge) as opened:

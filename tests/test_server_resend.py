@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -113,8 +114,9 @@ class TestFaults:
             assert server.statistics().responded == server.statistics().unanswered == 0
 
     async def test_timestamps_that_the_middleware_does_not_give(
-        self, fake_graph: FakeGraph
+        self, fake_graph: FakeGraph, monkeypatch: pytest.MonkeyPatch
     ) -> None:
+        monkeypatch.setattr(time, "time_ns", lambda: 0)
         async with fake_graph.session() as session:
             holder = Holder()
             session.serve(ECHO, "/held", holder)

@@ -62,5 +62,11 @@ def take_requests(take: Callable[[Any], Any], request_type: type, most: int) -> 
 
 
 def qos_of(service: Service) -> QoSProfile:
-    """Return a copy of the QoS of a service that has not been destroyed."""
-    return QoSProfile(**service.handle.qos)
+    """Return a copy of the QoS of a service.
+
+    Raises:
+        InvalidHandle: it was destroyed, for example because another thread shuts the context down.
+    """
+    # rclpy crashes if it is destroyed in the meantime.
+    with service.handle:
+        return QoSProfile(**service.handle.qos)

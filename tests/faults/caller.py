@@ -8,15 +8,14 @@ import threading
 import time
 from typing import Any
 
-from rosasync import Limits, Retry, Session
+from rosasync import Limits, Session
 from tests.faults.table import Row
-from tests.faults.trial import Trial, resident_megabytes
+from tests.faults.trial import PATIENT, Trial, resident_megabytes
 from tests.support.process import Child, serve_commands
 from tests.support.times import LIMIT, TICK, until
 
 __all__ = ["CallerProcess"]
 
-PATIENT = Retry(attempts=1_000, after=4 * TICK, backoff=1)
 TEN_MINUTES = 600.0
 
 

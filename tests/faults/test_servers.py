@@ -11,7 +11,7 @@ import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from rosasync import Limits, Retry, Session
-from tests.faults.trial import Trial
+from tests.faults.trial import PATIENT, Trial
 from tests.support.echo import ECHO, request_of, service_class
 from tests.support.nodes import borrowed_node
 from tests.support.servers import Misbehaviour, ServerProcess
@@ -19,7 +19,6 @@ from tests.support.serving import FORMS
 from tests.support.times import LIMIT, TICK, until
 
 TRIGGER = "std_srvs/srv/Trigger"
-PATIENT = Retry(attempts=100, after=4 * TICK, backoff=1)
 TRANSIENT = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 

@@ -15,15 +15,17 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
-from rosasync import Limits, RosasyncError, Session
+from rosasync import Limits, Retry, RosasyncError, Session
 from tests.faults.table import MARGIN, Row
 from tests.support.checks import count_descriptors, count_threads
 from tests.support.echo import ECHO, answer_to, request_of
 from tests.support.process import SHARED_MEMORY
 from tests.support.times import LIMIT, TICK, until
 
-__all__ = ["QUICK", "Trial", "resident_megabytes"]
+__all__ = ["PATIENT", "QUICK", "Trial", "resident_megabytes"]
 
+PATIENT = Retry(attempts=1_000, after=4 * TICK, backoff=1)
+"""Sends a request again until its deadline."""
 QUICK = Limits(grace=2 * TICK)
 """Limits under which the places of abandoned requests come back soon."""
 
