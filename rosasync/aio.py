@@ -15,6 +15,8 @@ from typing import Any, TypeVar
 import anyio
 from anyio.lowlevel import checkpoint_if_cancelled
 
+from rosasync.errors import RosasyncError
+
 __all__ = ["Deadlines", "Expired", "call_in_thread", "start_task", "until_done"]
 
 T = TypeVar("T")
@@ -176,6 +178,9 @@ async def call_in_thread(function: Callable[[], T], name: str) -> T:
     Args:
         function: the function. Its exceptions are raised here.
         name: the name of the thread.
+
+    Raises:
+        RosasyncError: the process is out of threads.
     """
     loop = asyncio.get_running_loop()
     ended: asyncio.Future[None] = loop.create_future()
@@ -191,7 +196,10 @@ async def call_in_thread(function: Callable[[], T], name: str) -> T:
             loop.call_soon_threadsafe(ended.set_result, None)
 
     thread = threading.Thread(target=run, name=name)
-    thread.start()
+    try:
+        thread.start()
+    except RuntimeError as error:
+        raise RosasyncError(f"the process is out of threads: {error}") from error
     try:
         await until_done(ended)
     finally:

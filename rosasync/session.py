@@ -122,7 +122,7 @@ class Session:
             ValueError: ROS does not allow the node's name.
             SessionClosed: the session was closed during the opening.
             OSError: the process is out of file descriptors.
-            RuntimeError: the process is out of threads.
+            RosasyncError: the process is out of threads, or rclpy cannot create the node.
         """
         if self._core is not None or self._closed or self._opening:
             raise UsageError("a session can be opened only once: create a new one")

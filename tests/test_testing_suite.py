@@ -371,7 +371,7 @@ class TestSeveralServers:
         ros_graph.stub(Trigger, LAMP, optional=True)
         # The middleware allows one type for each name in a process.
         error = UsageError if ros_graph.kind == "real" else ServiceUnavailable
-        with pytest.raises(error, match=r"lamp.* type|lamp \(std_srvs/srv/Trigger\)"):
+        with pytest.raises(error, match=r"lamp.* type|served as std_srvs/srv/Trigger"):
             await switch(session, timeout=TICK)
 
     async def test_a_hundred_calls_at_once(self, ros_graph: Graph, session: Session) -> None:

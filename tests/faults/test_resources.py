@@ -19,7 +19,7 @@ as_root = pytest.mark.skipif(
 )
 
 SHARED = """
-import contextlib, gc, os, resource, subprocess
+import contextlib, gc, os, resource, subprocess, tempfile
 from rosasync import RosasyncError
 from tests.support.checks import count_descriptors
 from tests.support.echo import ECHO
@@ -66,13 +66,16 @@ THREADS = """
 async def main():
     await use()
     print("called", flush=True)
-    os.setgroups([])
-    os.setgid(61_234)
-    os.setuid(61_234)
-    resource.setrlimit(resource.RLIMIT_NPROC, (1, 1_000))
-    assert await refused()
-    resource.setrlimit(resource.RLIMIT_NPROC, (1_000, 1_000))
-    await use()
+    with tempfile.TemporaryDirectory() as logs:
+        os.environ["ROS_LOG_DIR"] = logs
+        os.chown(logs, 61_234, 61_234)
+        os.setgroups([])
+        os.setgid(61_234)
+        os.setuid(61_234)
+        resource.setrlimit(resource.RLIMIT_NPROC, (1, 1_000))
+        assert await refused()
+        resource.setrlimit(resource.RLIMIT_NPROC, (1_000, 1_000))
+        await use()
 
 asyncio.run(main())
 """
