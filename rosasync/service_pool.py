@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 import math
 from collections import OrderedDict
 from collections.abc import Callable
@@ -19,6 +18,7 @@ from rosasync.client import Client
 from rosasync.client_set import ClientSet
 from rosasync.errors import ContextShutdown, RosasyncError
 from rosasync.latency import LatencyHistogram, summarize
+from rosasync.mismatch import MismatchWarning
 from rosasync.ports import PortDestroyed
 from rosasync.retry import Attempts, RetryBudget
 from rosasync.statistics import KeyStatistics
@@ -29,18 +29,13 @@ if TYPE_CHECKING:
     from rosasync.ports import NodePort, Service
     from rosasync.tracing import CallTrace, Outcome, Tracing
 
-__all__ = ["MATCH_TIMEOUT", "MISMATCH_LOGGER", "ServicePool"]
-
-MISMATCH_LOGGER = "rosasync.mismatch"
-"""The logger of the warning about servers of another type, so that it can be silenced alone."""
+__all__ = ["MATCH_TIMEOUT", "ServicePool"]
 
 OnClient = Callable[[Client], None]
 """Called with the client when one is granted."""
 
 GONE_DELAY = 0.02
 """Seconds to wait for responses that the last server sent just before it vanished."""
-MISMATCH_DELAY = 1.0
-"""Seconds for which callers wait for a server, before a warning says that it has another type."""
 MATCH_TIMEOUT = 1.0
 """Seconds to wait until a new client is matched with a server that the graph already shows."""
 
@@ -85,10 +80,7 @@ class ServicePool:
         self._dispatch_scheduled = False
         # Started when the last server has vanished; ends the requests after GONE_DELAY.
         self._gone_timer: asyncio.TimerHandle | None = None
-        # When callers began to wait for a match; None while none does.
-        self._unmatched_since: float | None = None
-        # What the last warning said, so that it is not repeated.
-        self._mismatch: str | None = None
+        self._mismatch = MismatchWarning(service, node)
         self._ending: Callable[[], Exception] | None = None
 
     def __repr__(self) -> str:
@@ -263,7 +255,7 @@ class ServicePool:
             try:
                 await self._wait_until_ready(client, match_by)
             except Expired:
-                self._warn_of_mismatch()
+                self._mismatch.warn()
                 return
 
     def is_ready(self) -> bool:
@@ -300,7 +292,8 @@ class ServicePool:
         self._clients.share_queue()
         if self.has_callers() or self._clients.awaits_resend:
             self._dispatch()
-        self._check_wait()
+        # Called by every poll, and callers who wait for a match keep the watch polling.
+        self._mismatch.check(self.awaits_match, self._loop.time())
         outstanding = self._clients.is_outstanding
         if outstanding and self._gone_timer is None and self._clients.find_lost_requests():
             self._gone_timer = self._loop.call_later(GONE_DELAY, self._end_requests)
@@ -475,31 +468,6 @@ class ServicePool:
     ) -> None:
         self._unmatched.pop(trace, None)
         trace.end(outcome, error)
-
-    # Servers of another type.
-
-    def _check_wait(self) -> None:
-        """Warn if callers have waited for some time, and every server has another type.
-
-        Called by every poll, and callers who wait for a match keep the watch polling.
-        """
-        if not self.awaits_match:
-            self._unmatched_since = None
-        elif self._unmatched_since is None:
-            self._unmatched_since = self._loop.time()
-        elif self._loop.time() - self._unmatched_since >= MISMATCH_DELAY:
-            self._warn_of_mismatch()
-
-    def _warn_of_mismatch(self) -> None:
-        mismatch = self._node.explain_mismatch(self.service)
-        if mismatch is not None and mismatch != self._mismatch:
-            logging.getLogger(MISMATCH_LOGGER).warning(
-                "%s: callers wait for a server of type %s, but %s: call it with the server's type, "
-                "or stop that server",
-                *self.service.key[:2],
-                mismatch,
-            )
-        self._mismatch = mismatch
 
     # Failures.
 

@@ -16,7 +16,7 @@ import typer
 
 import rosasync
 from rosasync.cli.errors import CliError, Code, code_of, line_of
-from rosasync.service_pool import MISMATCH_LOGGER
+from rosasync.mismatch import MISMATCH_LOGGER
 
 __all__ = ["fail", "open_session", "run", "silence_stdout"]
 

@@ -1,4 +1,4 @@
-"""Child processes of the tests, driven by JSON lines on their stdin and stdout.
+"""Child processes of the tests, driven by JSON lines on their stdin and answered on a pipe.
 
 The parent holds a :class:`Child`; the child runs :func:`serve_commands`. A child ends when its
 stdin does, so none outlives the tests.
@@ -28,7 +28,12 @@ __all__ = ["Child", "ChildError", "profile", "serve_commands"]
 
 ROOT = Path(__file__).parents[2]
 SHARED_MEMORY = Path("/dev/shm")
+STDERR = 2
 
+ANSWERS = "ROSASYNC_TEST_ANSWERS"
+"""The environment variable that tells a child the descriptor on which its parent reads answers.
+
+The middleware logs its errors to stdout, from its first participant on."""
 
 _PROFILE_VARIABLE = (
     "FASTRTPS_DEFAULT_PROFILES_FILE"
@@ -87,13 +92,17 @@ class Child:
     ) -> None:
         self._lock = threading.Lock()
         with profile(lease) as variables:
+            reading, writing = os.pipe()
+            self._answers = os.fdopen(reading, "rb")
             self._process = subprocess.Popen(
-                [*prefix, sys.executable, "-m", self.module, *args],
+                [*prefix, sys.executable, "-X", "faulthandler", "-m", self.module, *args],
                 stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
+                stdout=STDERR,
+                pass_fds=(writing,),
                 cwd=ROOT,
-                env=os.environ | variables | dict(environment or {}),
+                env=os.environ | variables | {ANSWERS: str(writing)} | dict(environment or {}),
             )
+            os.close(writing)
             self.ask_now("ready")
 
     @property
@@ -111,14 +120,19 @@ class Child:
         return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
     def ask_now(self, command: str, **arguments: Any) -> Any:
-        """Send a command and block until the child has answered it."""
-        stdin, stdout = self._pipes()
+        """Send a command and block until the child has answered it.
+
+        A child that does not answer is ended, and its threads' stacks go to stderr: the next test
+        gets another.
+        """
         with self._lock:
-            stdin.write(json.dumps({"do": command, "with": arguments}).encode() + b"\n")
-            stdin.flush()
-            ready, _, _ = select.select([stdout], [], [], 4 * LIMIT)
-            assert ready, f"{self.module} did not answer {command!r}"
-            line = stdout.readline()
+            self._stdin.write(json.dumps({"do": command, "with": arguments}).encode() + b"\n")
+            self._stdin.flush()
+            ready, _, _ = select.select([self._answers], [], [], 4 * LIMIT)
+            if not ready:
+                self.kill(stacks=True)
+                raise AssertionError(f"{self.module} did not answer {command!r}")
+            line = self._answers.readline()
         assert line, f"{self.module} ended with code {self._process.wait()}"
         answer = json.loads(line)
         if "error" in answer:
@@ -129,9 +143,17 @@ class Child:
         """Send a command and wait for the answer without blocking the loop."""
         return await asyncio.to_thread(self.ask_now, command, **arguments)
 
-    def kill(self) -> None:
-        """End it as a crash does (SIGKILL), and remove the shared memory it leaves behind."""
+    def kill(self, *, stacks: bool = False) -> None:
+        """End it as a crash does (SIGKILL), and remove the shared memory it leaves behind.
+
+        Args:
+            stacks: write its threads' stacks to stderr before.
+        """
         leftovers = self._shared_memory()
+        if stacks:
+            self._process.send_signal(signal.SIGABRT)
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(LIMIT / 4)
         self._process.kill()
         self._reap()
         for file in leftovers:
@@ -143,34 +165,40 @@ class Child:
         self.close()
 
     def close(self) -> None:
-        """Ask it to end by closing its stdin, and wait for that; kill it if it does not end."""
+        """Ask it to end by closing its stdin, and wait for that; end it if it does not."""
         with suppress(BrokenPipeError):
-            self._pipes()[0].close()
+            self._stdin.close()
         try:
             self._process.wait(LIMIT)
         except subprocess.TimeoutExpired:
-            self.kill()
+            self.kill(stacks=True)
             raise
         self._reap()
 
     def _reap(self) -> None:
         self._process.wait()
-        for pipe in self._pipes():
-            with suppress(BrokenPipeError):
-                pipe.close()
+        self._answers.close()
+        with suppress(BrokenPipeError):
+            self._stdin.close()
 
-    def _pipes(self) -> tuple[IO[bytes], IO[bytes]]:
+    @property
+    def _stdin(self) -> IO[bytes]:
         assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        return self._process.stdin, self._process.stdout
+        return self._process.stdin
 
     def _shared_memory(self) -> list[Path]:
-        """The Fast DDS segments of this process: it holds the lock file ``…_el`` of each."""
+        """The Fast DDS segments of this process: it holds the lock file ``…_el`` of each.
+
+        Not its ports: their numbers are shared by all domains of the machine, and another process
+        may have taken one over by the time it is removed.
+        """
         files: list[Path] = []
         for descriptor in Path(f"/proc/{self.pid}/fd").glob("*"):
             with suppress(OSError):
                 lock = descriptor.readlink()
-                if lock.parent == SHARED_MEMORY and lock.name.endswith("_el"):
+                if lock.parent != SHARED_MEMORY or lock.name.startswith("fastrtps_port"):
+                    continue
+                if lock.name.endswith("_el"):
                     files += [lock, lock.with_name(lock.name.removesuffix("_el"))]
         return files
 
@@ -198,9 +226,7 @@ def serve_commands(commands: Mapping[str, Callable[..., Any]]) -> None:
             keyword, and its return value is sent to the parent as JSON.
     """
     commands = {"ready": lambda: None, **commands}
-    # The middleware logs its errors to stdout; they belong to stderr then.
-    answers = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)
+    answers = os.fdopen(int(os.environ[ANSWERS]), "w")
     for line in sys.stdin.buffer:
         message = json.loads(line)
         try:
