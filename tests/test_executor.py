@@ -5,14 +5,17 @@ from __future__ import annotations
 import asyncio
 import functools
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import pytest
 import rclpy
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
+from rclpy.waitable import NumberOfEntities, Waitable
 from std_msgs.msg import Empty
 
 from rosasync import Limits, Session
@@ -41,6 +44,32 @@ def spinning(executor: Any) -> Iterator[None]:
         executor.create_task(lambda: None)
         thread.join()
         executor.shutdown()
+
+
+class SlowToCollect(Waitable):  # type: ignore[misc]
+    """Keeps an executor for a while between collecting a node's entities and using them."""
+
+    def __init__(self) -> None:
+        self._group = ReentrantCallbackGroup()
+        super().__init__(self._group)
+        self.collecting = threading.Event()
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, *exc: object) -> None:
+        pass
+
+    def get_num_entities(self) -> NumberOfEntities:
+        self.collecting.set()
+        time.sleep(2 * TICK)
+        return NumberOfEntities()
+
+    def add_to_wait_set(self, wait_set: Any) -> None:
+        pass
+
+    def is_ready(self, wait_set: Any) -> bool:
+        return False
 
 
 @pytest.fixture
@@ -208,6 +237,31 @@ class TestBorrowed:
                 assert session.node in executor.get_nodes()
                 await check_call(session, echo, "text")
             assert not executor.get_nodes()
+
+    async def test_the_users_spin_goes_on_when_the_node_is_destroyed(
+        self, bridge: Bridge, context: Any
+    ) -> None:
+        """It raised `InvalidHandle` if it was just collecting the node's entities."""
+        executor = SingleThreadedExecutor(context=context)
+        with spinning(executor):
+            async with Session(
+                "guest", bridge=bridge, context=context, executor=executor
+            ) as session:
+                slow = SlowToCollect()
+                session.node.add_waitable(slow)
+                executor.wake()
+                await asyncio.to_thread(slow.collecting.wait, LIMIT)
+            ticked = asyncio.Event()
+            executor.create_task(asyncio.get_running_loop().call_soon_threadsafe, ticked.set)
+            async with asyncio.timeout(LIMIT):
+                await ticked.wait()
+
+    async def test_an_executor_that_nothing_spins(self, bridge: Bridge, context: Any) -> None:
+        executor = SingleThreadedExecutor(context=context)
+        async with Session("guest", bridge=bridge, context=context, executor=executor):
+            pass
+        assert not executor.get_nodes()
+        executor.shutdown()
 
     async def test_two_sessions_on_one_node_in_the_users_executor(
         self, bridge: Bridge, node: Any, echo: str

@@ -26,7 +26,7 @@ from rosasync.ros import discovery, names, rcl
 from rosasync.ros.direct_bridge import DirectBridge
 from rosasync.ros.executor_bridge import ExecutorBridge
 from rosasync.ros.executor_thread import ExecutorThread, ThreadUser, executor_thread_of
-from rosasync.ros.failures import RclpyError, check_up, is_up, refusal
+from rosasync.ros.failures import InvalidHandle, RclpyError, check_up, is_up, refusal
 from rosasync.ros.graph import GraphQueries, GraphWaitable
 from rosasync.ros.messages import request_message
 
@@ -42,6 +42,9 @@ DIRECT_TRIED = ("rmw_fastrtps_cpp", "rmw_fastrtps_dynamic_cpp")
 
 JOIN_TIMEOUT = 5.0
 """Seconds to wait for the executor thread to finish its current callback."""
+
+LEAVE_TIMEOUT = 0.2
+"""Seconds to wait for an executor that has lost the session's node to begin another turn."""
 
 CALLBACK_RAISED = "a callback of the node raised an exception; the session goes on"
 
@@ -190,6 +193,8 @@ class RosNode:
         """Wait, after `stop`, until `join` returns at once and `close` is safe."""
         if self._thread is not None:
             await self._left.wait()
+        if self._user_executor is not None and self._own_node is not None:
+            await _leave(self._user_executor, self._own_node)
         await asyncio.sleep(self._opened.destroy_delay)
 
     def close(self) -> None:
@@ -328,6 +333,23 @@ class RosNode:
             logger.error(CALLBACK_RAISED, exc_info=error)
         else:
             self._gateway.post_if_open(self._loop.call_exception_handler, context)
+
+
+async def _leave(executor: Executor, node: Node) -> None:
+    """Remove a node from a user's executor, so that it can be destroyed without harm.
+
+    An executor that builds its wait set from the node's entities while they are destroyed raises
+    `InvalidHandle` out of its ``spin`` (rclpy issue 1355). So this waits until it has begun another
+    turn, but not for ever: nothing may spin it.
+    """
+    loop = asyncio.get_running_loop()
+    turn = asyncio.Event()
+    executor.remove_node(node)
+    with contextlib.suppress(InvalidHandle, RuntimeError):
+        executor.create_task(loop.call_soon_threadsafe, turn.set)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(LEAVE_TIMEOUT):
+                await turn.wait()
 
 
 def _introduced(domain: int) -> contextlib.AbstractContextManager[None]:
