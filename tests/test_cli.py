@@ -17,6 +17,7 @@ import pytest
 
 from rosasync.demo.run import Report, Samples
 from rosasync.demo.stock import READY
+from tests.support.process import ended
 
 LIMIT = 120.0
 ROSASYNC = (sys.executable, "-m", "rosasync")
@@ -160,7 +161,7 @@ def test_ctrl_c_ends_the_demo_and_its_server() -> None:
 
 def test_stock_server_ends_with_its_standard_input() -> None:
     command = (sys.executable, "-m", "rosasync.demo.stock", "/rosasync_test/echo")
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as server:
+    with ended(subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)) as server:
         assert server.stdin is not None
         assert server.stdout is not None
         assert server.stdout.readline() == READY

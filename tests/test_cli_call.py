@@ -11,8 +11,9 @@ import pytest
 import yaml
 
 from tests.support.command import LAMP, LAMP_TYPE, json_lines, own, rosasync, terminal
-from tests.support.process import ROOT
+from tests.support.process import ROOT, ended
 from tests.support.servers import ServerProcess
+from tests.support.times import LIMIT
 
 pytestmark = pytest.mark.usefixtures("lamp")
 
@@ -56,8 +57,10 @@ def test_several_documents_of_a_file_and_of_standard_input(tmp_path: Path) -> No
 
 def test_answers_each_document_before_the_input_ends() -> None:
     command = (sys.executable, "-m", "rosasync", "call", LAMP, LAMP_TYPE, "-", "--json")
-    with subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT
+    with ended(
+        subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT
+        )
     ) as process:
         assert process.stdin is not None
         assert process.stdout is not None
@@ -66,8 +69,8 @@ def test_answers_each_document_before_the_input_ends() -> None:
         assert json.loads(process.stdout.readline()) == {"success": True, "message": "True"}
         process.stdin.close()
         (summary,) = json_lines(process.stdout.read())
+        assert process.wait(LIMIT) == 0
     assert summary["summary"]["answered"] == 1
-    assert process.returncode == 0
 
 
 def test_count_concurrency_and_rate_end_with_a_summary() -> None:

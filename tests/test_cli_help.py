@@ -12,7 +12,7 @@ import pytest
 
 from tests.support.command import LAMP, LAMP_TYPE, LIMIT, rosasync
 from tests.support.introspected import NAME, IntrospectedProcess
-from tests.support.process import ROOT
+from tests.support.process import ROOT, ended
 
 COMMANDS = [
     *("call", "list", "type", "find", "show", "info", "nodes"),
@@ -91,7 +91,7 @@ def run_until_it_serves(arguments: list[str]) -> int:
         text=True,
         cwd=ROOT,
     )
-    with process:
+    with ended(process):
         assert process.stderr is not None
         for line in process.stderr:
             if line.startswith(("serving", "watching")):
@@ -130,13 +130,13 @@ def test_a_watch_ends_after_a_count() -> None:
             text=True,
             cwd=ROOT,
         )
-        with process:
+        with ended(process):
             assert process.stderr is not None
             assert process.stdout is not None
             for line in process.stderr:
                 if line.startswith("watching"):
                     watched.call(False)
             lines = process.stdout.read().splitlines()
-        assert process.returncode == 0
+            assert process.wait(LIMIT) == 0
     assert [line.split()[1] for line in lines] == ["request_received", "response_sent"]
     assert lines[0].endswith('{"data": false}')

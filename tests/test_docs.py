@@ -26,7 +26,7 @@ from sybil.parsers.markdown import CodeBlockParser
 
 import rosasync
 from rosasync.ros.domain import isolate
-from tests.support.process import ROOT, profile
+from tests.support.process import ROOT, ended, profile
 from tests.support.project import python_path
 from tests.support.servers import running
 from tests.support.times import LIMIT
@@ -127,7 +127,7 @@ class Servers:
             process = subprocess.Popen(
                 (sys.executable, str(path)), env=os.environ | environment, stderr=subprocess.DEVNULL
             )
-            self._stack.callback(end, process)
+            self._stack.enter_context(ended(process))
         return self._environments[program]
 
     def close(self) -> None:
@@ -142,28 +142,18 @@ def another_domain() -> dict[str, str]:
     return {"ROS_DOMAIN_ID": str(domain)}
 
 
-def end(process: subprocess.Popen[Any]) -> None:
-    """Terminate a stock node. Its signal handler does not always wake its spin."""
-    process.terminate()
-    try:
-        process.wait(LIMIT / 4)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
-
-
 @contextmanager
 def until_terminated(program: Path, expected: str) -> Iterator[None]:
     """Run a program until SIGTERM; check what it prints before and after, and its exit code."""
     process = subprocess.Popen((sys.executable, str(program)), stdout=subprocess.PIPE, text=True)
-    with process:
+    with ended(process):
         assert process.stdout is not None
         first = process.stdout.readline()
         yield
         process.terminate()
         rest = process.stdout.read()
+        assert process.wait(LIMIT) == 0
     assert first + rest == expected
-    assert process.returncode == 0
 
 
 def shell(command: str, folder: Path) -> str:

@@ -10,6 +10,7 @@ import pytest
 
 from benchmarks.hosts import NoHosts
 from benchmarks.lossy import LossyHosts
+from tests.support.process import ended
 
 PACKETS = 400
 ECHO = """
@@ -49,7 +50,7 @@ def test_three_hosts() -> None:
             spaces = [Path("/run/netns", hosts.namespace(n)) for n in ("server", "one", "two")]
             assert all(space.exists() for space in spaces)
             command = [*hosts.on("server"), sys.executable, "-c", ECHO]
-            with subprocess.Popen(command, stdout=subprocess.PIPE) as server:
+            with ended(subprocess.Popen(command, stdout=subprocess.PIPE)) as server:
                 assert server.stdout is not None
                 assert server.stdout.readline() == b"ready\n"
                 assert ask(hosts, "one", PACKETS) == ask(hosts, "two", PACKETS) == PACKETS
@@ -57,7 +58,6 @@ def test_three_hosts() -> None:
                 hosts.set(loss=0.2)
                 assert ask(hosts, "one", 40) < 40
                 assert hosts.counts()["lost"] > 0
-                server.terminate()
     except NoHosts as exc:
         pytest.skip(str(exc))
     assert not any(space.exists() for space in spaces)

@@ -110,7 +110,7 @@ class TestCalls:
         await traced.wait_for_service(ECHO, "/silent")
         with pytest.raises(ResponseTimeout) as caught:
             await traced.call(
-                ECHO, "/silent", timeout=6 * TICK, retry=Retry(after=TICK, backoff=1.0)
+                ECHO, "/silent", timeout=40 * TICK, retry=Retry(after=TICK, backoff=1.0)
             )
         assert trace.of("client") == ["sent > sent again > sent again > timed out"]
         assert trace.error("client") is caught.value

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import rclpy
 from rclpy.context import Context
-from rclpy.exceptions import InvalidNodeNameException
+from rclpy.exceptions import InvalidHandle, InvalidNodeNameException
 from rclpy.executors import Executor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, qos_profile_system_default
@@ -26,7 +26,7 @@ from rosasync.ros import discovery, names, rcl
 from rosasync.ros.direct_bridge import DirectBridge
 from rosasync.ros.executor_bridge import ExecutorBridge
 from rosasync.ros.executor_thread import ExecutorThread, ThreadUser, executor_thread_of
-from rosasync.ros.failures import InvalidHandle, RclpyError, check_up, is_up, refusal
+from rosasync.ros.failures import RclpyError, check_up, is_up, refusal
 from rosasync.ros.graph import GraphQueries, GraphWaitable
 from rosasync.ros.messages import request_message
 

@@ -20,11 +20,13 @@ from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import IO, Any, Self
+from typing import IO, Any, Self, TypeVar
 
 from tests.support.times import LIMIT
 
-__all__ = ["Child", "ChildError", "profile", "serve_commands"]
+__all__ = ["Child", "ChildError", "ended", "profile", "serve_commands"]
+
+AnyStr = TypeVar("AnyStr", str, bytes)
 
 ROOT = Path(__file__).parents[2]
 SHARED_MEMORY = Path("/dev/shm")
@@ -64,6 +66,21 @@ def profile(lease: int = 20) -> Iterator[dict[str, str]]:
         file = Path(folder) / "profile.xml"
         file.write_text(_PROFILE.format(seconds=lease))
         yield {_PROFILE_VARIABLE: str(file)}
+
+
+@contextmanager
+def ended(process: subprocess.Popen[AnyStr]) -> Iterator[subprocess.Popen[AnyStr]]:
+    """End a process with the block, also if the block raises."""
+    with process:
+        try:
+            yield process
+        finally:
+            process.terminate()
+            try:
+                process.wait(LIMIT / 4)
+            except subprocess.TimeoutExpired:
+                # rclpy's signal handler shuts the context down, but does not always wake its spin.
+                process.kill()
 
 
 class ChildError(Exception):

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from tests.support.echo import ECHO, fill, response_to, service_class
-from tests.support.process import Child, profile, serve_commands
+from tests.support.process import Child, ended, profile, serve_commands
 from tests.support.times import LIMIT
 
 __all__ = ["Delay", "Misbehaviour", "ServerProcess", "running"]
@@ -40,22 +40,13 @@ it precedes each answer by others under the numbers of earlier requests and of n
 
 
 @contextmanager
-def running(program: Path) -> Iterator[None]:
+def running(program: Path, *arguments: str) -> Iterator[None]:
     """Run a program of the documentation that serves the calls of this block."""
-    command = (sys.executable, str(program))
-    with (
-        profile() as environment,
-        subprocess.Popen(
-            command, env=os.environ | environment, stderr=subprocess.DEVNULL
-        ) as server,
-    ):
-        yield
-        server.terminate()
-        try:
-            server.wait(LIMIT / 4)
-        except subprocess.TimeoutExpired:
-            # rclpy's signal handler shuts the context down, but does not always wake its spin.
-            server.kill()
+    command = (sys.executable, str(program), *arguments)
+    with profile() as environment:
+        server = subprocess.Popen(command, env=os.environ | environment, stderr=subprocess.DEVNULL)
+        with ended(server):
+            yield
 
 
 class ServerProcess(Child):

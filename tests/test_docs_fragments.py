@@ -1,0 +1,136 @@
+"""The fragments of the pages, run one by one: what a page shows without a program around it."""
+
+from __future__ import annotations
+
+import ast
+import asyncio
+import logging
+import types
+from collections.abc import AsyncIterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import anyio
+import pytest
+from rcl_interfaces.srv import GetParameters
+from std_srvs.srv import SetBool, Trigger
+
+import rosasync
+from rosasync.lifecycle import LifecycleClient
+from rosasync.parameters import ParameterClient
+from rosasync.testing import Graph
+from tests.support.servers import running
+from tests.support.times import LIMIT
+from tests.test_docs import DOCS, EXAMPLES, NAME, name_of, python_blocks
+
+NOT_RUN = {
+    "from launch import": "needs ROS's launch",
+    "import uvloop": "has no main; test_loops runs it",
+    "from my_interfaces": "has a type of the reader's own",
+    "goal = await": "needs an action; test_wrap_future has one",
+    "def ": "defines functions for a program that the reader has",
+    "class ": "the same",
+    "FromBlackboard(": "needs a tree; test_behaviours has one",
+    "self._service_proxy": "is what another library does",
+    "response = await client.call(request)  # before": "is what rclpy does",
+    "async with session.serve": "serves for ever; test_server_iteration does so",
+}
+"""Beginnings of fragments that are only compiled, by `test_docs`, and why."""
+
+NODES = {"parameters": "arm", "lifecycle": "camera"}
+"""The pages whose fragments need stock nodes, and the program of these nodes."""
+
+
+def fragments(*pages: Path) -> list[Any]:
+    """Return the fragments of pages as parameters of a test."""
+    return [
+        pytest.param(code, id=f"{name_of(page)}-{number}")
+        for page in pages
+        for number, code in enumerate(python_blocks(page))
+        if not NAME.match(code) and not code.startswith(tuple(NOT_RUN)) and "__main__" not in code
+        if "asyncio.run(main())" not in code and "app.exec()" not in code
+    ]
+
+
+def plain_pages() -> list[Path]:
+    """Return the pages whose fragments need nothing but services."""
+    special = {*NODES, "testing"}
+    found = [*DOCS.glob("*.md"), *DOCS.glob("how-to/*.md"), *DOCS.glob("reference/*.md")]
+    return sorted(page for page in found if page.stem not in special)
+
+
+async def run(code: str, names: dict[str, Any]) -> None:
+    """Run a fragment, which may await."""
+    tree = compile(code, "fragment", "exec", ast.PyCF_ALLOW_TOP_LEVEL_AWAIT)
+    done = types.FunctionType(tree, names)()
+    if asyncio.iscoroutine(done):
+        await done
+
+
+def known(session: rosasync.Session) -> dict[str, Any]:
+    """Return what the reader of a page has by then."""
+    return {
+        **{module.__name__: module for module in (anyio, asyncio, logging, rosasync)},
+        **{named.__name__: named for named in (LifecycleClient, ParameterClient, Path)},
+        "Move": SetBool,
+        "SetBool": SetBool,
+        "Trigger": Trigger,
+        "handler": lambda request: SetBool.Response(success=request.data),
+        "session": session,
+    }
+
+
+@pytest.fixture
+async def graph(monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Graph]:
+    """A graph with the services that the pages call; new sessions are in it."""
+    async with Graph(strict=False) as graph:
+        for name in ("/arm/enable", "/lamp/switch"):
+            graph.stub(SetBool, name, {"success": True})
+        for name in ("/gripper/open", "/map/rebuild"):
+            graph.stub(Trigger, name, {"success": True})
+        monkeypatch.setattr(rosasync, "Session", graph.session)
+        yield graph
+
+
+@pytest.mark.parametrize("code", fragments(*plain_pages()))
+async def test_fragment(code: str, graph: Graph) -> None:
+    if "# an error in the type checker" in code:
+        code = "".join(line for line in code.splitlines(True) if "# an error" not in line)
+    async with graph.session() as session:
+        await run(code, known(session))
+
+
+@pytest.mark.usefixtures("own_domain")
+class TestNodes:
+    """The pages on nodes, with as many of theirs as a fragment names."""
+
+    @pytest.mark.parametrize("code", fragments(DOCS / "how-to" / "parameters.md"))
+    async def test_parameters(
+        self, code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.chdir(tmp_path)
+        (tmp_path / "all.yaml").write_text("/**:\n  ros__parameters:\n    speed: 0.5\n")
+        await self._run(code, "arm")
+
+    @pytest.mark.parametrize("code", fragments(DOCS / "how-to" / "lifecycle.md"))
+    async def test_lifecycle(self, code: str) -> None:
+        await self._run(code, "camera")
+
+    async def _run(self, code: str, node: str) -> None:
+        namespaces = ("/left", "/right") if "/left" in code else ("",)
+        with ExitStack() as stack:
+            for namespace in namespaces:
+                arguments = ("--ros-args", "-r", f"__ns:={namespace or '/'}")
+                stack.enter_context(running(EXAMPLES / "nodes" / f"{node}.py", *arguments))
+            async with rosasync.Session("tutorial") as session:
+                for namespace in namespaces:
+                    name = f"{namespace}/{node}/get_parameters"
+                    await session.wait_for_service(GetParameters, name, timeout=LIMIT)
+                await run(code, {**known(session), "arm": ParameterClient(session, "/arm")})
+
+
+def test_each_reason_is_needed() -> None:
+    everything = [code for page in DOCS.rglob("*.md") for code in python_blocks(page)]
+    unused = [start for start in NOT_RUN if not any(c.startswith(start) for c in everything)]
+    assert not unused
