@@ -70,7 +70,9 @@ class CallerProcess(Child):
         enough = await self.answered() + count
         deadline = time.monotonic() + 3 * LIMIT
         while await self.answered() < enough:
-            assert time.monotonic() < deadline, f"less than {count} calls were answered"
+            if time.monotonic() > deadline:
+                state = await self.ask("state")
+                raise AssertionError(f"less than {count} calls were answered: {state}")
             await asyncio.sleep(TICK)
 
     async def stop(self) -> Row:
@@ -87,6 +89,7 @@ class _Callers:
         self._stopped = False
         self._thread: threading.Thread | None = None
         self._trial: Trial | None = None
+        self._session: Session | None = None
         self._failure: BaseException | None = None
 
     def start(self, **options: Any) -> None:
@@ -99,6 +102,16 @@ class _Callers:
         if self._failure is not None:
             raise self._failure
         return self._trial.row.answered if self._trial is not None else 0
+
+    def state(self) -> str:
+        """Say what becomes of the calls, for a failure that nobody watched."""
+        if self._trial is None or self._session is None:
+            return "nothing was called yet"
+        statistics = self._session.pool.statistics()
+        return (
+            f"{self._trial.row}, {dict(self._trial.failed)}, {statistics}, "
+            f"and last {self._trial.last_error!r}"
+        )
 
     def stop(self) -> str:
         self._stopped = True
@@ -151,6 +164,7 @@ class _Callers:
                 await one()
 
         async with trial.session(limits=Limits(grace=20 * TICK)) as session:
+            self._session = session
             async with asyncio.TaskGroup() as group:
                 group.create_task(self._watch_memory(trial))
                 for _ in range(callers):
@@ -182,7 +196,8 @@ class _Callers:
 
 def main() -> None:
     callers = _Callers()
-    serve_commands({"start": callers.start, "answered": callers.answered, "stop": callers.stop})
+    commands = (callers.start, callers.answered, callers.state, callers.stop)
+    serve_commands({command.__name__: command for command in commands})
     callers.end()
 
 

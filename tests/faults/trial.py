@@ -48,6 +48,7 @@ class Trial:
         self.row = Row(fault, bridge)
         self.bridge = bridge
         self.growth = 50.0
+        self.last_error: BaseException | None = None
         self._failed: Counter[str] = Counter()
         self._places = 0
         self._numbers = itertools.count()
@@ -92,6 +93,7 @@ class Trial:
         except (RosasyncError, asyncio.CancelledError) as error:
             kind = type(error).__name__
             self._failed[kind] += 1
+            self.last_error = error
             if isinstance(error, asyncio.CancelledError):
                 raise
             return kind
