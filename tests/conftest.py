@@ -17,6 +17,7 @@ import uvloop
 
 from rosasync import Session
 from rosasync.ros.domain import isolate
+from rosasync.ros.shared_memory import unfinished_ports
 from tests.faults.table import pytest_terminal_summary
 from tests.support.clients import ClientProcess
 from tests.support.servers import ServerProcess
@@ -59,6 +60,9 @@ def pytest_asyncio_loop_factories(
 @pytest.fixture(autouse=True)
 def nothing_left_behind(caplog: pytest.LogCaptureFixture) -> Iterator[None]:
     """Fail a test that leaves a thread behind, or an exception that asyncio only logged."""
+    # A process that an earlier test killed may have left one; the processes of this one would hang.
+    for port in unfinished_ports(int(os.environ["ROS_DOMAIN_ID"])):
+        port.unlink(missing_ok=True)
     before = set(threading.enumerate())
     yield
     # The threads in which asyncio waits for a child process end a moment after the process.

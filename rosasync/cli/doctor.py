@@ -22,6 +22,7 @@ from rosasync.cli.run import open_session, run
 from rosasync.cli.why import environment
 from rosasync.profile import SWITCH, is_old, profile_variable, switched_off, user_profile
 from rosasync.ros.middleware import check_middleware, installed_middlewares
+from rosasync.ros.shared_memory import describe, remedy, unfinished_ports
 
 __all__ = ["doctor"]
 
@@ -92,6 +93,9 @@ def _middleware(report: Report) -> bool:
 
 def _shared_memory(report: Report) -> None:
     """Check that Fast DDS can use shared memory; without it, it falls back to UDP."""
+    if left := unfinished_ports(int(os.environ.get("ROS_DOMAIN_ID") or 0)):
+        report.add("shared memory", False, describe(left), remedy(left))
+        return
     usable = os.access(SHARED_MEMORY, os.W_OK | os.X_OK)
     free = shutil.disk_usage(SHARED_MEMORY).free if usable else 0
     files = len(list(SHARED_MEMORY.glob("fast*")))

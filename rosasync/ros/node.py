@@ -29,6 +29,7 @@ from rosasync.ros.executor_thread import ExecutorThread, ThreadUser, executor_th
 from rosasync.ros.failures import RclpyError, check_up, is_up, refusal
 from rosasync.ros.graph import GraphQueries, GraphWaitable
 from rosasync.ros.messages import request_message
+from rosasync.ros.shared_memory import check_ports
 
 if TYPE_CHECKING:
     from rosasync.ports import NodePort
@@ -247,7 +248,7 @@ class RosNode:
                 "rclpy.init(context=context) first, or leave it out"
             )
         try:
-            self._own_node = Node(node, context=context) if context else self._make_own(node)
+            self._own_node = self._make_own(node, context)
         except InvalidNodeNameException as error:
             reason = str(error).strip().replace("\n", " ")
             raise ValueError(f"{node!r} is not a valid node name: {reason}") from None
@@ -256,14 +257,21 @@ class RosNode:
             raise RosasyncError(f"rclpy cannot create the node {node!r}: {error}") from error
         return self._own_node
 
-    def _make_own(self, name: str) -> Node:
-        """Make a context and its node, with rosasync's profile if the middleware reads it now."""
+    def _make_own(self, name: str, context: Context | None) -> Node:
+        """Make a node, and a context for it if there is none."""
+        fast_dds = "fastrtps" in rclpy.get_rmw_implementation_identifier()
+        if context is not None:
+            if fast_dds:
+                check_ports(context.get_domain_id())
+            return Node(name, context=context)
         self._own_context = Context()
         rclpy.init(context=self._own_context, signal_handler_options=SignalHandlerOptions.NO)
-        if "fastrtps" not in rclpy.get_rmw_implementation_identifier():
+        if not fast_dds:
             return Node(name, context=self._own_context)
         domain = self._own_context.get_domain_id()
-        # The first node of a context makes its participant.
+        check_ports(domain)
+        # The first node of a context makes its participant, and the first of a process has the
+        # middleware read rosasync's profile.
         with profile.applied(first=not discovery.own_ports(domain)), _introduced(domain):
             return Node(name, context=self._own_context)
 

@@ -20,6 +20,8 @@ as_root = pytest.mark.skipif(
 
 SHARED = """
 import contextlib, gc, os, resource, subprocess, tempfile
+from importlib.metadata import version
+from pathlib import Path
 from rosasync import RosasyncError
 from tests.support.checks import count_descriptors
 from tests.support.echo import ECHO
@@ -92,6 +94,21 @@ async def main():
 asyncio.run(main())
 """
 
+UNFINISHED = """
+async def main():
+    prefix = "fastrtps" if version("rclpy").startswith("7.") else "fastdds"
+    left = Path(f"/dev/shm/{prefix}_port7000")
+    for content in (b"", bytes(50_000), b"\\1" + bytes(50_000)):
+        left.write_bytes(content)
+        os.utime(left, (0, 0))
+        assert await refused(), content[:2]
+    left.unlink()
+    await use()
+    print("called", flush=True)
+
+asyncio.run(main())
+"""
+
 
 async def test_no_descriptors(trial: Trial) -> None:
     await _run(trial, DESCRIPTORS)
@@ -104,8 +121,19 @@ async def test_no_threads(trial: Trial) -> None:
 
 @as_root
 async def test_no_shared_memory(trial: Trial) -> None:
-    mount = 'mount -t tmpfs -o size=16k tmpfs /dev/shm && exec "$@"'
-    await _run(trial, MEMORY, "unshare", "--mount", "sh", "-c", mount, "sh")
+    await _run(trial, MEMORY, *own_shared_memory("16k"))
+
+
+@as_root
+async def test_shared_memory_that_a_dead_process_left_unfinished(trial: Trial) -> None:
+    """Fast DDS waits for it for ever (Fast-DDS issue 3878)."""
+    await _run(trial, UNFINISHED, *own_shared_memory("64m"))
+
+
+def own_shared_memory(size: str) -> tuple[str, ...]:
+    """Return the beginning of a command line: what it starts has a ``/dev/shm`` of its own."""
+    mount = f'mount -t tmpfs -o size={size} tmpfs /dev/shm && exec "$@"'
+    return ("unshare", "--mount", "sh", "-c", mount, "sh")
 
 
 async def _run(trial: Trial, program: str, *prefix: str) -> None:

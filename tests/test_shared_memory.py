@@ -1,0 +1,68 @@
+"""Ports in shared memory that were left unfinished, told from all others."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+import pytest
+
+from rosasync import RosasyncError
+from rosasync.profile import is_old
+from rosasync.ros import shared_memory
+from rosasync.ros.shared_memory import check_ports, unfinished_ports
+
+PREFIX = "fastrtps_port" if is_old() else "fastdds_port"
+DOMAIN = 3
+READY = b"\2\0\0\0" + bytes(100)
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(shared_memory, "FOLDER", tmp_path)
+    return tmp_path
+
+
+def leave(folder: Path, name: str, content: bytes = b"", age: float = 60.0) -> Path:
+    """Leave a file behind."""
+    file = folder / name
+    file.write_bytes(content)
+    os.utime(file, (time.time() - age,) * 2)
+    return file
+
+
+@pytest.mark.parametrize("content", [b"", b"\0" * 50_000, b"\1\0\0\0" + bytes(100)])
+def test_unfinished(folder: Path, content: bytes) -> None:
+    every = [leave(folder, f"{PREFIX}{number}", content) for number in (7003, 8151, 8399)]
+    assert unfinished_ports(DOMAIN) == every
+    with pytest.raises(RosasyncError, match=f"; end it with: rm {every[0]} {every[1]}"):
+        check_ports(DOMAIN)
+
+
+@pytest.mark.parametrize("content", [READY, b"\3\0\0\0" + bytes(100)])
+def test_ready_or_corrupted(folder: Path, content: bytes) -> None:
+    leave(folder, f"{PREFIX}7000", content)
+    check_ports(DOMAIN)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "fastrtps_port8149",
+        "fastrtps_port8400",
+        "fastdds_port8149",
+        "fastdds_port7000_el",
+        "fastrtps_port7000_el",
+        "fastrtps_7000",
+        "sem.fastrtps_port7000_mutex",
+    ],
+)
+def test_other_files(folder: Path, name: str) -> None:
+    leave(folder, name)
+    check_ports(DOMAIN)
+
+
+def test_being_created(folder: Path) -> None:
+    leave(folder, f"{PREFIX}7000", age=0.0)
+    check_ports(DOMAIN)
