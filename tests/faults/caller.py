@@ -23,6 +23,7 @@ class CallerProcess(Child):
     """The parent's side of one such process."""
 
     module = "tests.faults.caller"
+    stock = False
 
     async def start(
         self,

@@ -99,6 +99,8 @@ class Child:
     """
 
     module: str
+    stock = True
+    """Whether rosasync is not used in it. Stock rclpy may hang at its end, in the middleware."""
 
     def __init__(
         self,
@@ -182,14 +184,15 @@ class Child:
         self.close()
 
     def close(self) -> None:
-        """Ask it to end by closing its stdin, and wait for that; end it if it does not."""
+        """Ask it to end by closing its stdin, and wait for that; kill it if it does not end."""
         with suppress(BrokenPipeError):
             self._stdin.close()
         try:
             self._process.wait(LIMIT)
         except subprocess.TimeoutExpired:
             self.kill(stacks=True)
-            raise
+            if not self.stock:
+                raise
         self._reap()
 
     def _reap(self) -> None:
