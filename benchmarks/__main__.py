@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 from pathlib import Path
 from typing import Annotated
@@ -11,7 +12,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from benchmarks.allocations import measure_allocations, show_allocations
-from benchmarks.commands import add_commands
+from benchmarks.commands import add_commands, save
 from benchmarks.machine import describe_machine
 from benchmarks.results import Results
 from benchmarks.runner import Runner
@@ -126,6 +127,21 @@ def network(
     network.measure_network(results, cells, minutes, make_console().print)
     if page:
         network.write_network(results, page, json.parent)
+
+
+@app.command()
+def window(
+    seconds: Annotated[float, typer.Option(min=0.1, help="Seconds between two events.")] = 2.0,
+    plot: Annotated[Path, typer.Option(help="Where to draw it.")] = Path(
+        "docs/benchmarks/window.svg"
+    ),
+) -> None:
+    """The window of one session while clients come and go, and the server is killed."""
+    from benchmarks import window
+
+    isolate()
+    story = asyncio.run(window.follow(seconds))
+    save(window.draw(story), plot)
 
 
 @app.command()

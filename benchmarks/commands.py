@@ -20,7 +20,7 @@ from benchmarks.tables import make_console, make_table
 from benchmarks.trials import Goal, Trials
 from rosasync.ros.domain import isolate
 
-__all__ = ["add_commands"]
+__all__ = ["add_commands", "save"]
 
 T = TypeVar("T")
 

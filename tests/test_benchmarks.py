@@ -275,6 +275,13 @@ SMALL_RUNS = {
 }
 
 
+def test_the_window_is_drawn(tmp_path: Path) -> None:
+    plot = tmp_path / "window.svg"
+    command = ("window", "--seconds=0.3", f"--plot={plot}")
+    subprocess.run([sys.executable, "-m", "benchmarks", *command], cwd=ROOT, check=True)
+    assert "the server is killed" in plot.read_text()
+
+
 @pytest.mark.parametrize("command", SMALL_RUNS)
 def test_a_small_run(command: str, tmp_path: Path) -> None:
     file = tmp_path / "rows.json"
