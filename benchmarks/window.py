@@ -97,7 +97,7 @@ async def follow(pause: float) -> Story:
             "four more", lambda: asyncio.gather(*(another(number) for number in range(3, 7)))
         )
         await event("they leave", lambda: asyncio.gather(*(o.aclose() for o in (second, *others))))
-        await event("the server is killed", lambda: asyncio.to_thread(server.kill))
+        await event("server killed", lambda: asyncio.to_thread(server.kill))
         server.close()
         server = await event(
             "another starts", lambda: asyncio.to_thread(StockServer, NAME, HANDLING)

@@ -94,26 +94,33 @@ asyncio.run(main())
         assert "KeyboardInterrupt" in errors
         assert "ResourceWarning" not in errors
 
-    async def test_ctrl_c_that_another_thread_gets_wakes_an_idle_loop_with_a_signal_handler(
-        self, bridge: Bridge
+    @pytest.mark.parametrize(
+        ("loop", "handles"),
+        [("asyncio", True), ("uvloop", False)],
+        ids=["asyncio with a signal handler", "uvloop"],
+    )
+    async def test_ctrl_c_that_another_thread_gets_wakes_an_idle_loop(
+        self, bridge: Bridge, loop: str, handles: bool
     ) -> None:
-        """As `docs/how-to/deploy.md` says. Without the handler, the idle loop goes on sleeping."""
+        """As `docs/how-to/deploy.md` says. Without the handler, asyncio's loop goes on sleeping."""
         program = """
-import signal, threading, time
+import importlib, signal, threading, time
 def interrupt():
     time.sleep(2.0)  # The pool polls for a moment after a call.
     signal.pthread_kill(threading.get_ident(), signal.SIGINT)
 async def main():
     stop = asyncio.Event()
-    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, stop.set)
+    if HANDLES:
+        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, stop.set)
     async with Session("idle", bridge=bridge, timeout=None) as session:
         # A deadline would be a timer, which wakes the loop.
         await check_call(session, "/echo", "text", timeout=None)
         print("called", flush=True)
         threading.Thread(target=interrupt).start()
         await stop.wait()
-asyncio.run(main())
+importlib.import_module(LOOP).run(main())
 """
+        program = program.replace("HANDLES", str(handles)).replace("LOOP", repr(loop))
         code, errors = await run_program(bridge, program)
         assert code in (130, -signal.SIGINT), errors
         assert "KeyboardInterrupt" in errors
