@@ -30,13 +30,12 @@ class Moment:
     """One sample, `at` seconds from the start.
 
     Attributes:
-        places: what is taken of the window, by waiting callers and by abandoned requests.
+        places: the places that are taken, by requests in flight and by abandoned ones.
         answered: calls answered since the start.
     """
 
     at: float
     window: int
-    share: int
     places: int
     answered: int
 
@@ -50,14 +49,13 @@ class Story:
 
 
 async def follow(pause: float) -> Story:
-    """Call a stock server with sixteen callers while its clients and itself change.
+    """Call a stock server while other clients come and go, and the server is killed and replaced.
 
     Args:
         pause: seconds between two events.
     """
     srv_type = load_type(Work().srv_type)
     story = Story([], [])
-    start = time.monotonic()
     async with AsyncExitStack() as stack:
         server = StockServer(NAME, HANDLING)
         stack.callback(lambda: server.close())
@@ -76,7 +74,7 @@ async def follow(pause: float) -> Story:
                 (found,) = session.pool.statistics().keys.values()
                 places = found.in_flight + found.abandoned
                 at = time.monotonic() - start
-                story.moments.append(Moment(at, found.window, found.share, places, found.completed))
+                story.moments.append(Moment(at, found.window, places, found.completed))
                 await asyncio.sleep(EVERY)
 
         async def another(number: int) -> Session:
@@ -91,21 +89,23 @@ async def follow(pause: float) -> Story:
             return await action()
 
         start = time.monotonic()
-        tasks = [asyncio.create_task(work()) for work in (*[caller] * CALLERS, sample)]
-        second = await event("a second client", lambda: another(2))
-        others = await event(
-            "four more", lambda: asyncio.gather(*(another(number) for number in range(3, 7)))
-        )
-        await event("they leave", lambda: asyncio.gather(*(o.aclose() for o in (second, *others))))
-        await event("server killed", lambda: asyncio.to_thread(server.kill))
-        server.close()
-        server = await event(
-            "another starts", lambda: asyncio.to_thread(StockServer, NAME, HANDLING)
-        )
-        await asyncio.sleep(pause)
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        async with asyncio.TaskGroup() as group:
+            tasks = [group.create_task(work()) for work in (*[caller] * CALLERS, sample)]
+            second = await event("a second client", lambda: another(2))
+            others = await event(
+                "four more", lambda: asyncio.gather(*(another(number) for number in range(3, 7)))
+            )
+            await event(
+                "they leave", lambda: asyncio.gather(*(o.aclose() for o in (second, *others)))
+            )
+            await event("server killed", lambda: asyncio.to_thread(server.kill))
+            server.close()
+            server = await event(
+                "another starts", lambda: asyncio.to_thread(StockServer, NAME, HANDLING)
+            )
+            await asyncio.sleep(pause)
+            for task in tasks:
+                task.cancel()
     return story
 
 

@@ -1,4 +1,4 @@
-"""The warning that callers wait for a service all of whose servers have another type."""
+"""Warns if callers wait for a service whose servers all have another type."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from rosasync.ports import NodePort, Service
 
-__all__ = ["MISMATCH_DELAY", "MISMATCH_LOGGER", "MismatchWarning"]
+__all__ = ["MISMATCH_DELAY", "MISMATCH_LOGGER", "MismatchReporter"]
 
 MISMATCH_LOGGER = "rosasync.mismatch"
 """The logger of the warning, so that it can be silenced alone."""
@@ -16,8 +16,8 @@ MISMATCH_DELAY = 1.0
 """Seconds for which callers wait for a server before the warning."""
 
 
-class MismatchWarning:
-    """Warns once of each mismatch that keeps the callers of one service waiting."""
+class MismatchReporter:
+    """Logs one warning for each mismatch that keeps callers of a service waiting."""
 
     def __init__(self, service: Service, node: NodePort) -> None:
         self._service = service

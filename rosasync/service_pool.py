@@ -18,7 +18,7 @@ from rosasync.client import Client
 from rosasync.client_set import ClientSet
 from rosasync.errors import ContextShutdown, RosasyncError
 from rosasync.latency import LatencyHistogram, summarize
-from rosasync.mismatch import MismatchWarning
+from rosasync.mismatch import MismatchReporter
 from rosasync.ports import PortDestroyed
 from rosasync.retry import Attempts, RetryBudget
 from rosasync.statistics import KeyStatistics
@@ -80,7 +80,7 @@ class ServicePool:
         self._dispatch_scheduled = False
         # Started when the last server has vanished; ends the requests after GONE_DELAY.
         self._gone_timer: asyncio.TimerHandle | None = None
-        self._mismatch = MismatchWarning(service, node)
+        self._mismatch = MismatchReporter(service, node)
         self._ending: Callable[[], Exception] | None = None
 
     def __repr__(self) -> str:
@@ -292,7 +292,7 @@ class ServicePool:
         self._clients.share_queue()
         if self.has_callers() or self._clients.awaits_resend:
             self._dispatch()
-        # Called by every poll, and callers who wait for a match keep the watch polling.
+        # Every poll runs this, and the watch polls while callers wait for a match.
         self._mismatch.check(self.awaits_match, self._loop.time())
         outstanding = self._clients.is_outstanding
         if outstanding and self._gone_timer is None and self._clients.find_lost_requests():

@@ -60,7 +60,7 @@ def pytest_asyncio_loop_factories(
 @pytest.fixture(autouse=True)
 def nothing_left_behind(caplog: pytest.LogCaptureFixture) -> Iterator[None]:
     """Fail a test that leaves a thread behind, or an exception that asyncio only logged."""
-    # A process that an earlier test killed may have left one; the processes of this one would hang.
+    # A process that an earlier test killed may have left one, and the next would wait for it.
     for port in unfinished_ports(int(os.environ["ROS_DOMAIN_ID"])):
         port.unlink(missing_ok=True)
     before = set(threading.enumerate())

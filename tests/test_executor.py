@@ -62,7 +62,7 @@ class SlowToCollect(Waitable):  # type: ignore[misc]
 
     def get_num_entities(self) -> NumberOfEntities:
         self.collecting.set()
-        time.sleep(2 * TICK)
+        time.sleep(TICK)
         return NumberOfEntities()
 
     def add_to_wait_set(self, wait_set: Any) -> None:
@@ -250,7 +250,7 @@ class TestBorrowed:
                 slow = SlowToCollect()
                 session.node.add_waitable(slow)
                 executor.wake()
-                await asyncio.to_thread(slow.collecting.wait, LIMIT)
+                assert await asyncio.to_thread(slow.collecting.wait, LIMIT)
             ticked = asyncio.Event()
             executor.create_task(asyncio.get_running_loop().call_soon_threadsafe, ticked.set)
             async with asyncio.timeout(LIMIT):
@@ -258,10 +258,22 @@ class TestBorrowed:
 
     async def test_an_executor_that_nothing_spins(self, bridge: Bridge, context: Any) -> None:
         executor = SingleThreadedExecutor(context=context)
-        async with Session("guest", bridge=bridge, context=context, executor=executor):
-            pass
+
+        async def open_and_close() -> None:
+            async with Session("guest", bridge=bridge, context=context, executor=executor):
+                pass
+
+        # A loop of its own: it is closed when the executor is spun.
+        await asyncio.to_thread(asyncio.run, open_and_close())
         assert not executor.get_nodes()
+        for _ in range(3):
+            executor.spin_once(timeout_sec=0.0)
         executor.shutdown()
+
+    async def test_an_executor_that_is_shut_down_first(self, bridge: Bridge, context: Any) -> None:
+        executor = SingleThreadedExecutor(context=context)
+        async with Session("guest", bridge=bridge, context=context, executor=executor):
+            executor.shutdown()
 
     async def test_two_sessions_on_one_node_in_the_users_executor(
         self, bridge: Bridge, node: Any, echo: str

@@ -22,7 +22,7 @@ from rosasync.cli.run import open_session, run
 from rosasync.cli.why import environment
 from rosasync.profile import SWITCH, is_old, profile_variable, switched_off, user_profile
 from rosasync.ros.middleware import check_middleware, installed_middlewares
-from rosasync.ros.shared_memory import describe, remedy, unfinished_ports
+from rosasync.ros.shared_memory import describe_unfinished, removal_command, unfinished_ports
 
 __all__ = ["doctor"]
 
@@ -62,7 +62,8 @@ async def _doctor(as_json: bool) -> int:
         _shared_memory(report)
         _multicast(report)
         _profile(report)
-        await _calls(report)
+        if _ports(report):
+            await _calls(report)
     return Code.FAILED if report.failed else Code.ANSWERED
 
 
@@ -93,9 +94,6 @@ def _middleware(report: Report) -> bool:
 
 def _shared_memory(report: Report) -> None:
     """Check that Fast DDS can use shared memory; without it, it falls back to UDP."""
-    if left := unfinished_ports(int(os.environ.get("ROS_DOMAIN_ID") or 0)):
-        report.add("shared memory", False, describe(left), remedy(left))
-        return
     usable = os.access(SHARED_MEMORY, os.W_OK | os.X_OK)
     free = shutil.disk_usage(SHARED_MEMORY).free if usable else 0
     files = len(list(SHARED_MEMORY.glob("fast*")))
@@ -106,6 +104,18 @@ def _shared_memory(report: Report) -> None:
         "Give a container more: docker run --shm-size=1g, or --ipc=host. Files of killed processes "
         "can be removed when no ROS process runs: fastdds shm clean",
     )
+
+
+def _ports(report: Report) -> bool:
+    """Check that no new node would wait forever; return whether one can be created."""
+    from rosasync.ros.inspect import middleware
+
+    domain = os.environ.get("ROS_DOMAIN_ID") or "0"
+    if "fastrtps" not in middleware() or not domain.isdecimal():
+        return True
+    if left := unfinished_ports(int(domain)):
+        report.add("ports", False, describe_unfinished(left), removal_command(left))
+    return not left
 
 
 def _multicast(report: Report) -> None:

@@ -45,7 +45,7 @@ JOIN_TIMEOUT = 5.0
 """Seconds to wait for the executor thread to finish its current callback."""
 
 LEAVE_TIMEOUT = 0.2
-"""Seconds to wait for an executor that has lost the session's node to begin another turn."""
+"""Maximum number of seconds to wait for a user's executor to begin its next turn."""
 
 CALLBACK_RAISED = "a callback of the node raised an exception; the session goes on"
 
@@ -222,16 +222,17 @@ class RosNode:
         check_up(self._node)
         self._name = str(self._node.get_name())
         executor = options.executor
-        if executor is not None and executor.add_node(self._node):
-            self._user_executor = executor
         librcl = rcl.load()
-        if _takes_callbacks(self._node.executor):
+        if _takes_callbacks(executor or self._node.executor):
             librcl = None
         self._bridge = self._make_bridge(options, librcl)
         self._graph = GraphQueries(self._node, events=librcl is not None)
         if librcl is not None:
             self._waitable = GraphWaitable(self._node, librcl, self._post_graph)
         self._node.context.on_shutdown(self._post_shutdown)
+        # Last: a failure before this destroys the node, which no executor may spin then.
+        if executor is not None and executor.add_node(self._node):
+            self._user_executor = executor
         self._thread = executor_thread_of(self._node, self._user)
 
     def _make_node(self, options: SessionOptions) -> Node:
@@ -257,23 +258,24 @@ class RosNode:
             raise RosasyncError(f"rclpy cannot create the node {node!r}: {error}") from error
         return self._own_node
 
-    def _make_own(self, name: str, context: Context | None) -> Node:
-        """Make a node, and a context for it if there is none."""
-        fast_dds = "fastrtps" in rclpy.get_rmw_implementation_identifier()
-        if context is not None:
-            if fast_dds:
-                check_ports(context.get_domain_id())
+    def _make_own(self, name: str, given: Context | None) -> Node:
+        """Make a node, and a context for it unless one is given."""
+        context = given
+        if context is None:
+            context = self._own_context = Context()
+            rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
+        if "fastrtps" not in rclpy.get_rmw_implementation_identifier():
             return Node(name, context=context)
-        self._own_context = Context()
-        rclpy.init(context=self._own_context, signal_handler_options=SignalHandlerOptions.NO)
-        if not fast_dds:
-            return Node(name, context=self._own_context)
-        domain = self._own_context.get_domain_id()
-        check_ports(domain)
-        # The first node of a context makes its participant, and the first of a process has the
-        # middleware read rosasync's profile.
-        with profile.applied(first=not discovery.own_ports(domain)), _introduced(domain):
-            return Node(name, context=self._own_context)
+        domain = context.get_domain_id()
+        has_participant = bool(discovery.own_ports(domain))
+        if given is None or not has_participant:
+            check_ports(domain)
+        if given is not None:
+            return Node(name, context=context)
+        # The first node of a context makes its participant. Fast DDS reads its profiles when a
+        # process makes its first participant.
+        with profile.applied(first=not has_participant), _introduced(domain):
+            return Node(name, context=context)
 
     def _make_bridge(self, options: SessionOptions, librcl: rcl.Rcl | None) -> Bridge:
         tried = rclpy.get_rmw_implementation_identifier() in DIRECT_TRIED
@@ -344,20 +346,27 @@ class RosNode:
 
 
 async def _leave(executor: Executor, node: Node) -> None:
-    """Remove a node from a user's executor, so that it can be destroyed without harm.
+    """Remove the session's node from a user's executor, so that it can be destroyed safely.
 
-    An executor that builds its wait set from the node's entities while they are destroyed raises
-    `InvalidHandle` out of its ``spin`` (rclpy issue 1355). So this waits until it has begun another
-    turn, but not for ever: nothing may spin it.
+    If entities are destroyed while an executor adds them to its wait set, its ``spin`` raises
+    `InvalidHandle` (rclpy issue 1355). So wait until the executor has begun another turn, but only
+    for `LEAVE_TIMEOUT`, because nothing may be spinning it.
     """
     loop = asyncio.get_running_loop()
     turn = asyncio.Event()
+
+    def report() -> None:
+        # The executor may run this after the loop was closed.
+        with contextlib.suppress(RuntimeError):
+            loop.call_soon_threadsafe(turn.set)
+
     executor.remove_node(node)
-    with contextlib.suppress(InvalidHandle, RuntimeError):
-        executor.create_task(loop.call_soon_threadsafe, turn.set)
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(LEAVE_TIMEOUT):
-                await turn.wait()
+    # AttributeError: an executor of Jazzy that was shut down has no guard condition to trigger.
+    with contextlib.suppress(AttributeError, InvalidHandle, RuntimeError, TimeoutError):
+        # Two tasks: the turn that runs the first may have listed its nodes before the removal.
+        executor.create_task(executor.create_task, report)
+        async with asyncio.timeout(LEAVE_TIMEOUT):
+            await turn.wait()
 
 
 def _introduced(domain: int) -> contextlib.AbstractContextManager[None]:

@@ -1,76 +1,100 @@
-"""Ports of Fast DDS in shared memory that were left unfinished: each would block a newcomer."""
+"""Finds ports in shared memory that Fast DDS did not finish creating."""
 
 from __future__ import annotations
 
+import os
 import re
 import sys
 import time
 from pathlib import Path
 
 from rosasync.errors import RosasyncError
-from rosasync.profile import is_old
+from rosasync.profile import is_old, user_profile
+from rosasync.ros.discovery import BASE, DOMAIN_GAIN
 
-__all__ = ["check_ports", "describe", "remedy", "unfinished_ports"]
+__all__ = ["check_ports", "describe_unfinished", "removal_command", "unfinished_ports"]
 
 FOLDER = Path("/dev/shm")
 READY = 2
 """The first word of a segment that boost has initialised (``managed_open_or_create_impl.hpp``)."""
 GRACE = 2.0
-"""Seconds after which a port that is being created counts as left unfinished."""
+"""Seconds to wait for a port to become ready before it counts as unfinished."""
 
-FIRST_OF_ALL, FIRST, PER_DOMAIN = 7000, 7400, 250
-"""The ports of every domain begin at the first; those of a domain as in RTPS 2.5, 9.6.1."""
+COMMON = range(7000, BASE)
+"""The numbers of ports that participants of every domain use."""
 
 
 def unfinished_ports(domain: int) -> list[Path]:
-    """Find the ports that would block a participant of this domain for ever.
+    """Find the ports for which a new participant of this domain would wait forever.
 
-    Every participant opens ports in shared memory, the free one with the lowest number. A process
-    that dies while it creates one, or finds no memory for it, leaves a file that never becomes
+    Every participant opens ports in shared memory, beginning with the lowest free number. A process
+    that dies while it creates one, or runs out of shared memory, leaves a file that never becomes
     ready, and Fast DDS waits until it does (https://github.com/eProsima/Fast-DDS/issues/3878).
 
+    Blocks for `GRACE` if there are any.
+
     Returns:
-        The files: they are empty, or begin with a word that says that they are not ready.
+        The files: they are empty, or begin with a word that says that they are not ready. None if
+        Fast DDS is configured not to use shared memory.
     """
+    if not _uses_shared_memory():
+        return []
     prefix = "fastrtps_port" if is_old() else "fastdds_port"
-    begin = FIRST + domain * PER_DOMAIN
-    found = []
-    for file in sorted(FOLDER.glob(f"{prefix}*")):
-        number = re.fullmatch(rf"{prefix}(\d+)", file.name)
-        if number and _concerns(int(number[1]), begin) and _is_unfinished(file):
-            found.append(file)
+    own = range(BASE + DOMAIN_GAIN * domain, BASE + DOMAIN_GAIN * (domain + 1))
+    found = [
+        file
+        for file in sorted(FOLDER.glob(f"{prefix}*"))
+        if (name := re.fullmatch(rf"{prefix}(\d+)", file.name))
+        and (int(name[1]) in COMMON or int(name[1]) in own)
+        and _is_unfinished(file)
+    ]
+    # A port that a live process is creating is ready within milliseconds.
+    deadline = time.monotonic() + GRACE
+    while found and time.monotonic() < deadline:
+        time.sleep(0.01)
+        found = [file for file in found if _is_unfinished(file)]
     return found
 
 
 def check_ports(domain: int) -> None:
-    """Raise an error instead of blocking for ever.
+    """Raise an error where Fast DDS would wait forever.
 
     Raises:
-        RosasyncError: a port was left unfinished.
+        RosasyncError: there are unfinished ports.
     """
     if found := unfinished_ports(domain):
-        raise RosasyncError(f"{describe(found)}; end it with: {remedy(found)}")
+        raise RosasyncError(f"{describe_unfinished(found)}. Remove it: {removal_command(found)}")
 
 
-def describe(ports: list[Path]) -> str:
-    """Say what unfinished ports do."""
+def describe_unfinished(ports: list[Path]) -> str:
+    """Say what unfinished ports do, and where they come from."""
     files = ", ".join(map(str, ports))
-    return f"a process died while it created {files}, and every new node waits for that for ever"
+    return (
+        f"every new node would wait forever for {files}: a process died, or ran out of shared "
+        "memory, while it created this"
+    )
 
 
-def remedy(ports: list[Path]) -> str:
-    """Return the command that removes them."""
+def removal_command(ports: list[Path]) -> str:
+    """Return the command that removes the files."""
     return f"rm {' '.join(map(str, ports))}"
 
 
-def _concerns(number: int, begin: int) -> bool:
-    return FIRST_OF_ALL <= number < FIRST or begin <= number < begin + PER_DOMAIN
+def _uses_shared_memory() -> bool:
+    """Return whether Fast DDS uses shared memory, as far as its configuration tells."""
+    transports = os.environ.get("FASTDDS_BUILTIN_TRANSPORTS", "").partition("?")[0].upper()
+    if transports in ("NONE", "UDPV4", "UDPV6", "TCPV4", "TCPV6"):
+        return False
+    file = user_profile(is_old())
+    try:
+        text = file.read_text() if file else ""
+    except (OSError, ValueError):
+        return True
+    return "<useBuiltinTransports>false" not in text or "SHM" in text
 
 
 def _is_unfinished(file: Path) -> bool:
     try:
-        if time.time() - file.stat().st_mtime < GRACE:
-            return False
         with file.open("rb") as content:
             return int.from_bytes(content.read(4), sys.byteorder) < READY
     except OSError:

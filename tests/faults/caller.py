@@ -105,7 +105,7 @@ class _Callers:
         return self._trial.row.answered if self._trial is not None else 0
 
     def state(self) -> str:
-        """Say what becomes of the calls, for a failure that nobody watched."""
+        """Describe the calls so far, for the message of a failed test."""
         if self._trial is None or self._session is None:
             return "nothing was called yet"
         statistics = self._session.pool.statistics()

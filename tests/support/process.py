@@ -30,12 +30,13 @@ AnyStr = TypeVar("AnyStr", str, bytes)
 
 ROOT = Path(__file__).parents[2]
 SHARED_MEMORY = Path("/dev/shm")
+PORTS = ("fastrtps_port", "fastdds_port")
 STDERR = 2
 
 ANSWERS = "ROSASYNC_TEST_ANSWERS"
-"""The environment variable that tells a child the descriptor on which its parent reads answers.
+"""The environment variable with the descriptor on which a child writes its answers.
 
-The middleware logs its errors to stdout, from its first participant on."""
+Its stdout is not used, because the middleware logs errors there."""
 
 _PROFILE_VARIABLE = (
     "FASTRTPS_DEFAULT_PROFILES_FILE"
@@ -70,7 +71,7 @@ def profile(lease: int = 20) -> Iterator[dict[str, str]]:
 
 @contextmanager
 def ended(process: subprocess.Popen[AnyStr]) -> Iterator[subprocess.Popen[AnyStr]]:
-    """End a process with the block, also if the block raises."""
+    """Terminate a process at the end of the block, also if the block raises."""
     with process:
         try:
             yield process
@@ -100,7 +101,7 @@ class Child:
 
     module: str
     stock = True
-    """Whether rosasync is not used in it. Stock rclpy may hang at its end, in the middleware."""
+    """Whether it runs stock rclpy only, which may hang in the middleware when the process ends."""
 
     def __init__(
         self,
@@ -113,16 +114,22 @@ class Child:
         with profile(lease) as variables:
             reading, writing = os.pipe()
             self._answers = os.fdopen(reading, "rb")
-            self._process = subprocess.Popen(
-                [*prefix, sys.executable, "-X", "faulthandler", "-m", self.module, *args],
-                stdin=subprocess.PIPE,
-                stdout=STDERR,
-                pass_fds=(writing,),
-                cwd=ROOT,
-                env=os.environ | variables | {ANSWERS: str(writing)} | dict(environment or {}),
-            )
-            os.close(writing)
-            self.ask_now("ready")
+            try:
+                self._process = subprocess.Popen(
+                    [*prefix, sys.executable, "-X", "faulthandler", "-m", self.module, *args],
+                    stdin=subprocess.PIPE,
+                    stdout=STDERR,
+                    pass_fds=(writing,),
+                    cwd=ROOT,
+                    env=os.environ | variables | {ANSWERS: str(writing)} | dict(environment or {}),
+                )
+            finally:
+                os.close(writing)
+            try:
+                self.ask_now("ready")
+            except BaseException:
+                self.kill()
+                raise
 
     @property
     def pid(self) -> int:
@@ -152,7 +159,12 @@ class Child:
                 self.kill(stacks=True)
                 raise AssertionError(f"{self.module} did not answer {command!r}")
             line = self._answers.readline()
-        assert line, f"{self.module} ended with code {self._process.wait()}"
+        if not line:
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(LIMIT)
+            code = self._process.poll()
+            self.kill()
+            raise AssertionError(f"{self.module} ended with code {code}")
         answer = json.loads(line)
         if "error" in answer:
             raise ChildError(answer["error"])
@@ -216,7 +228,7 @@ class Child:
         for descriptor in Path(f"/proc/{self.pid}/fd").glob("*"):
             with suppress(OSError):
                 lock = descriptor.readlink()
-                if lock.parent != SHARED_MEMORY or lock.name.startswith("fastrtps_port"):
+                if lock.parent != SHARED_MEMORY or lock.name.startswith(PORTS):
                     continue
                 if lock.name.endswith("_el"):
                     files += [lock, lock.with_name(lock.name.removesuffix("_el"))]
