@@ -99,6 +99,7 @@ class Client:
         "_timed",
         "_timed_at",
         "_timer",
+        "_timer_due",
         "answered",
         "closed",
         "counts",
@@ -135,6 +136,7 @@ class Client:
         # Abandoned and waiting requests start it, and a caller that waits for the place of one may
         # set it to an earlier time. It stops when no such request is left.
         self._timer: asyncio.TimerHandle | None = None
+        self._timer_due = math.inf
         # The time of the last answer, or at which a place was last given up. Up to date while there
         # are abandoned requests or retried calls.
         self._silent_since = 0.0
@@ -417,11 +419,13 @@ class Client:
         due = min((ends for ends, _ in self._abandoned.values()), default=math.inf)
         if self._is_place_wanted():
             due = min(due, self._silent_since + self._response_times.patience)
-        if self._timer is not None and self._timer.when() > due:
+        if self._timer is not None and self._timer_due > due:
             self._timer.cancel()
             self._timer = None
         if self._timer is None and due < math.inf:
             self._timer = self._loop.call_at(due, self._on_timer, due)
+            # Not `when()`: uvloop gives no timer for a time that has come.
+            self._timer_due = due
 
     def _on_timer(self, due: float) -> None:
         self._timer = None

@@ -68,6 +68,21 @@ async def test_abandoned_requests_do_not_hold_the_window_for_the_grace_period(
         assert session.pool.statistics().abandoned == 0
 
 
+@pytest.mark.asyncio(loop_factories=["asyncio", "uvloop"])
+async def test_a_grace_that_has_ended_by_the_time_its_timer_is_set(fake_graph: FakeGraph) -> None:
+    """uvloop gives a handle that is no timer then; it was asked for its time."""
+    fake_graph.serve(Echo, "/echo", echo)
+    async with fake_graph.session(limits=Limits(grace=1e-9)) as session:
+        await session.wait_for_service(Echo, "/echo")
+        with fake_graph.drop_requests():
+            tasks = [session.start(Echo, "/echo", Echo.Request(n)) for n in range(3)]
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+            assert all(task.cancelled() for task in tasks)
+        assert await ask(session, "next", timeout=LIMIT) == "next"
+
+
 @pytest.mark.usefixtures("patience")
 async def test_a_lease_gets_its_place_back(fake_graph: FakeGraph) -> None:
     fake_graph.serve(Echo, "/echo", echo)

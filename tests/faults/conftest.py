@@ -30,6 +30,13 @@ def warm() -> dict[str, bool]:
     return {}
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Give the full forms more time: in debug mode, 20,000 calls take minutes."""
+    for item in items:
+        if item.get_closest_marker("faults"):
+            item.add_marker(pytest.mark.timeout(30 * 60))
+
+
 @pytest.fixture
 def record(request: pytest.FixtureRequest) -> Callable[[Row], None]:
     """Put a row into the report of the test, for the table at the end of the run."""

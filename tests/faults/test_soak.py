@@ -22,6 +22,7 @@ from tests.support.servers import ServerProcess
 from tests.support.times import TICK
 
 NAME = "/soaked"
+LEASE = 2
 PAUSE = 60 * TICK
 """The mean time between two disturbances, in seconds."""
 
@@ -51,7 +52,9 @@ class Network:
             yield network
 
     async def caller(self) -> CallerProcess:
-        caller = CallerProcess(lease=5, **self._on("client"))
+        # The same as the servers'. If only one side has forgotten the other after a partition,
+        # Fast DDS may not match them for more than a minute.
+        caller = CallerProcess(lease=LEASE, **self._on("client"))
         return await self._stack.enter_async_context(caller)
 
     async def restart(self, how: Callable[[ServerProcess], None]) -> None:
@@ -83,7 +86,7 @@ class Network:
         return {"prefix": self._hosts.on(host), "environment": self._hosts.environment}
 
     async def _server(self, host: str) -> ServerProcess:
-        server = ServerProcess(lease=2, **self._on(host))
+        server = ServerProcess(lease=LEASE, **self._on(host))
         await self._stack.enter_async_context(server)
         await server.serve(NAME)
         return server
