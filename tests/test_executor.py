@@ -46,6 +46,11 @@ def spinning(executor: Any) -> Iterator[None]:
         executor.shutdown()
 
 
+def guest(bridge: Bridge, executor: Any) -> Session:
+    """Make a session with a node of its own, which the user's executor spins."""
+    return Session("guest", bridge=bridge, context=executor.context, executor=executor)
+
+
 class SlowToCollect(Waitable):  # type: ignore[misc]
     """Keeps an executor for a while between collecting a node's entities and using them."""
 
@@ -231,9 +236,7 @@ class TestBorrowed:
     ) -> None:
         executor = SingleThreadedExecutor(context=context)
         with spinning(executor):
-            async with Session(
-                "guest", bridge=bridge, context=context, executor=executor
-            ) as session:
+            async with guest(bridge, executor) as session:
                 assert session.node in executor.get_nodes()
                 await check_call(session, echo, "text")
             assert not executor.get_nodes()
@@ -244,9 +247,7 @@ class TestBorrowed:
         """It raised `InvalidHandle` if it was just collecting the node's entities."""
         executor = SingleThreadedExecutor(context=context)
         with spinning(executor):
-            async with Session(
-                "guest", bridge=bridge, context=context, executor=executor
-            ) as session:
+            async with guest(bridge, executor) as session:
                 slow = SlowToCollect()
                 session.node.add_waitable(slow)
                 executor.wake()
@@ -260,7 +261,7 @@ class TestBorrowed:
         executor = SingleThreadedExecutor(context=context)
 
         async def open_and_close() -> None:
-            async with Session("guest", bridge=bridge, context=context, executor=executor):
+            async with guest(bridge, executor):
                 pass
 
         # A loop of its own: it is closed when the executor is spun.
@@ -272,7 +273,7 @@ class TestBorrowed:
 
     async def test_an_executor_that_is_shut_down_first(self, bridge: Bridge, context: Any) -> None:
         executor = SingleThreadedExecutor(context=context)
-        async with Session("guest", bridge=bridge, context=context, executor=executor):
+        async with guest(bridge, executor):
             executor.shutdown()
 
     async def test_two_sessions_on_one_node_in_the_users_executor(

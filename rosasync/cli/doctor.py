@@ -22,11 +22,15 @@ from rosasync.cli.run import open_session, run
 from rosasync.cli.why import environment
 from rosasync.profile import SWITCH, is_old, profile_variable, switched_off, user_profile
 from rosasync.ros.middleware import check_middleware, installed_middlewares
-from rosasync.ros.shared_memory import describe_unfinished, removal_command, unfinished_ports
+from rosasync.ros.shared_memory import (
+    FOLDER,
+    describe_unfinished,
+    removal_command,
+    unfinished_ports,
+)
 
 __all__ = ["doctor"]
 
-SHARED_MEMORY = Path("/dev/shm")
 ENOUGH = 64 << 20
 """Bytes of shared memory that some tens of Fast DDS processes need."""
 
@@ -94,13 +98,13 @@ def _middleware(report: Report) -> bool:
 
 def _shared_memory(report: Report) -> None:
     """Check that Fast DDS can use shared memory; without it, it falls back to UDP."""
-    usable = os.access(SHARED_MEMORY, os.W_OK | os.X_OK)
-    free = shutil.disk_usage(SHARED_MEMORY).free if usable else 0
-    files = len(list(SHARED_MEMORY.glob("fast*")))
+    usable = os.access(FOLDER, os.W_OK | os.X_OK)
+    free = shutil.disk_usage(FOLDER).free if usable else 0
+    files = len(list(FOLDER.glob("fast*")))
     report.add(
         "shared memory",
         usable and free > ENOUGH,
-        f"{free >> 20} MB free in {SHARED_MEMORY}, {files} files of Fast DDS",
+        f"{free >> 20} MB free in {FOLDER}, {files} files of Fast DDS",
         "Give a container more: docker run --shm-size=1g, or --ipc=host. Files of killed processes "
         "can be removed when no ROS process runs: fastdds shm clean",
     )

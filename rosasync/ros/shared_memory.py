@@ -12,7 +12,7 @@ from rosasync.errors import RosasyncError
 from rosasync.profile import is_old, user_profile
 from rosasync.ros.discovery import BASE, DOMAIN_GAIN
 
-__all__ = ["check_ports", "describe_unfinished", "removal_command", "unfinished_ports"]
+__all__ = ["FOLDER", "check_ports", "describe_unfinished", "removal_command", "unfinished_ports"]
 
 FOLDER = Path("/dev/shm")
 READY = 2

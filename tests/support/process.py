@@ -20,13 +20,11 @@ from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import IO, Any, Self, TypeVar
+from typing import IO, Any, AnyStr, Self
 
 from tests.support.times import LIMIT
 
 __all__ = ["Child", "ChildError", "ended", "profile", "serve_commands"]
-
-AnyStr = TypeVar("AnyStr", str, bytes)
 
 ROOT = Path(__file__).parents[2]
 SHARED_MEMORY = Path("/dev/shm")
@@ -228,9 +226,8 @@ class Child:
         for descriptor in Path(f"/proc/{self.pid}/fd").glob("*"):
             with suppress(OSError):
                 lock = descriptor.readlink()
-                if lock.parent != SHARED_MEMORY or lock.name.startswith(PORTS):
-                    continue
-                if lock.name.endswith("_el"):
+                is_port = lock.name.startswith(PORTS)
+                if lock.parent == SHARED_MEMORY and lock.name.endswith("_el") and not is_port:
                     files += [lock, lock.with_name(lock.name.removesuffix("_el"))]
         return files
 
