@@ -15,11 +15,13 @@ import pytest
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
+from std_srvs.srv import SetBool
 
 from rosasync import Session
 from rosasync.errors import ContextShutdown, InvalidServiceName, RosasyncError, UsageError
 from rosasync.ports import PortDestroyed
 from rosasync.ros import signals
+from rosasync.ros.rcl import Rcl
 from tests.conftest import Bridge
 from tests.support.checks import count_descriptors, count_threads
 from tests.support.echo import ECHO, request_of
@@ -157,6 +159,37 @@ async def test_a_service_that_the_program_destroys(bridge: Bridge) -> None:
             opened.answer(other, 1)
             await until(lambda: opened.responses)
     assert reported == []
+
+
+@pytest.mark.parametrize("kind", ["client", "service"])
+def test_what_is_destroyed_while_its_signal_is_set(
+    kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By another thread, which a call into librcl lets run."""
+    rcl = Rcl()
+    name, signal = {
+        "client": ("_on_response", rcl.signal_responses),
+        "service": ("_on_request", rcl.signal_requests),
+    }[kind]
+    function = getattr(rcl, name)
+    valid: list[bool] = []
+
+    def interrupted(pointer: int, *arguments: Any) -> int:
+        getattr(node, f"destroy_{kind}")(entity)
+        valid.append(entity.handle.pointer == pointer)
+        return int(function(pointer, *arguments))
+
+    monkeypatch.setattr(rcl, name, interrupted)
+    descriptor = os.eventfd(0)
+    with borrowed_node() as node:
+        callback = [] if kind == "client" else [lambda _, response: response]
+        entity = getattr(node, f"create_{kind}")(SetBool, "/interrupted", *callback)
+        signal(entity.handle, descriptor)
+        assert valid == [True, True]
+        assert not signal(entity.handle, descriptor)
+        assert not signal(entity.handle, None)
+    os.close(descriptor)
+    assert valid == [True, True]
 
 
 async def test_an_executor_that_the_program_shuts_down(bridge: Bridge) -> None:

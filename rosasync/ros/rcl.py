@@ -8,6 +8,8 @@ import sys
 from functools import cache
 from typing import Any
 
+from rclpy.exceptions import InvalidHandle
+
 __all__ = ["Rcl", "load"]
 
 
@@ -66,13 +68,17 @@ class Rcl:
 
 
 def _set_callback(function: Any, handle: Any, signal: Any, fd: int | None) -> bool:
-    if not handle.pointer:
+    try:
+        # Held, because another thread may destroy the node meanwhile, as a shutdown on Kilted does.
+        with handle:
+            if fd is None:
+                return bool(function(handle.pointer, None, None) == 0)
+            # rmw_fastrtps counts the queued messages and then installs its listener. A message that
+            # arrives in between is neither counted nor signalled, so a second call counts it.
+            arguments = (handle.pointer, signal, ctypes.c_void_p(fd))
+            return all(function(*arguments) == 0 for _ in range(2))
+    except InvalidHandle:
         return False
-    if fd is None:
-        return bool(function(handle.pointer, None, None) == 0)
-    # rmw_fastrtps counts the queued messages and then installs its listener. A message that arrives
-    # in between is neither counted nor signalled, so a second call counts it.
-    return all(function(handle.pointer, signal, ctypes.c_void_p(fd)) == 0 for _ in range(2))
 
 
 @cache
