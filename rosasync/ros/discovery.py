@@ -18,7 +18,7 @@ import struct
 from collections.abc import Iterator
 from pathlib import Path
 
-__all__ = ["introduced", "introduction", "own_ports", "ports_of"]
+__all__ = ["introduced", "introduction", "own_ports", "ports_of", "udp_sockets"]
 
 LEASE = 1
 """Seconds until the other participants forget the one that is introduced."""
@@ -51,7 +51,7 @@ def introduced(domain: int) -> Iterator[None]:
 def own_ports(domain: int) -> set[int]:
     """Return the ports on which this process's participants of the domain listen."""
     sockets, ports = _own_sockets(), ports_of(domain)
-    return {port for port, inode in _udp_sockets() if inode in sockets and port in ports}
+    return {port for port, inode in udp_sockets() if inode in sockets and port in ports}
 
 
 def _introduce(domain: int, port: int) -> None:
@@ -84,10 +84,18 @@ def introduction(domain: int, port: int) -> bytes:
     return header + struct.pack("<BBH", DATA, LITTLE_ENDIAN_WITH_DATA, len(sample)) + sample
 
 
-def ports_of(domain: int) -> range:
-    """Return the ports on which the participants of a host listen for announcements."""
+def ports_of(domain: int, participants: int = PARTICIPANTS) -> range:
+    """Return the ports on which the first participants of a host listen for announcements."""
     first = BASE + DOMAIN_GAIN * domain + UNICAST
-    return range(first, first + PARTICIPANT_GAIN * PARTICIPANTS, PARTICIPANT_GAIN)
+    return range(first, first + PARTICIPANT_GAIN * participants, PARTICIPANT_GAIN)
+
+
+def udp_sockets() -> Iterator[tuple[int, str]]:
+    """Yield the port and the inode of each UDP socket of this network namespace, if readable."""
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/self/net/udp").read_text().splitlines()[1:]:
+            fields = line.split()
+            yield int(fields[1].rpartition(":")[2], 16), fields[9]
 
 
 def _own_sockets() -> set[str]:
@@ -96,11 +104,3 @@ def _own_sockets() -> set[str]:
         with contextlib.suppress(OSError):
             names.add(os.readlink(descriptor))
     return {name[len("socket:[") : -1] for name in names if name.startswith("socket:[")}
-
-
-def _udp_sockets() -> Iterator[tuple[int, str]]:
-    """Yield the port and the inode of each UDP socket of this network namespace."""
-    with contextlib.suppress(OSError):
-        for line in Path("/proc/self/net/udp").read_text().splitlines()[1:]:
-            fields = line.split()
-            yield int(fields[1].rpartition(":")[2], 16), fields[9]

@@ -5,7 +5,6 @@ Every function may be called from any thread. The graph is what the node has dis
 
 from __future__ import annotations
 
-import contextlib
 import platform
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from rosasync.ros import endpoints, rcl
+from rosasync.ros.discovery import ports_of, udp_sockets
 from rosasync.ros.endpoints import clients_of, full_name, incompatibility, servers_of
 from rosasync.ros.names import default_qos
 
@@ -41,8 +41,8 @@ __all__ = [
 DISCOVERY_TOPIC = "ros_discovery_info"
 """The topic on which each context announces its nodes: one writer for each participant."""
 
-PORT_BASE, PORT_GAIN, PORT_OFFSET = 7400, 250, 10
-"""How RTPS computes the first port of a participant in a domain (RTPS 2.5, 9.6.2)."""
+PARTICIPANTS = 120
+"""Participants of a host whose ports fit between those of two domains (RTPS 2.3, 9.6.1)."""
 
 SAFE_DOMAINS = 102
 """The ports of higher domains are also used for other purposes (Linux's ephemeral ports)."""
@@ -110,13 +110,13 @@ def all_discovered(node: Node) -> bool:
     domain. Participants on other machines, or in other network namespaces, cannot be counted. The
     names of its nodes may come some time after its endpoints.
     """
-    local = _local_participants(domain_id(node))
+    local = _local_participants(domain_id(node), _used_ports())
     return 0 < local <= _participants(node) <= len(node_names(node))
 
 
 def local_domains() -> dict[int, int]:
     """Return the ROS domains in use on this machine, with their number of participants."""
-    ports = _udp_ports()
+    ports = _used_ports()
     counts = {domain: _local_participants(domain, ports) for domain in range(SAFE_DOMAINS)}
     return {domain: count for domain, count in counts.items() if count}
 
@@ -192,16 +192,11 @@ def _participants(node: Node) -> int:
     return len(node.get_publishers_info_by_topic(DISCOVERY_TOPIC, no_mangle=True))
 
 
-def _local_participants(domain: int, ports: set[int] | None = None) -> int:
+def _local_participants(domain: int, used: set[int]) -> int:
     """Count the participants of a domain on this machine by their UDP ports; 0 if unknown."""
-    first = PORT_BASE + PORT_GAIN * domain + PORT_OFFSET
-    used = _udp_ports() if ports is None else ports
-    return sum(port in used for port in range(first, first + PORT_GAIN - PORT_OFFSET, 2))
+    return len(used.intersection(ports_of(domain, PARTICIPANTS)))
 
 
-def _udp_ports() -> set[int]:
+def _used_ports() -> set[int]:
     """Return the UDP ports in use in this network namespace, none if they cannot be read."""
-    with contextlib.suppress(OSError):
-        lines = Path("/proc/net/udp").read_text().splitlines()[1:]
-        return {int(line.split()[1].rpartition(":")[2], 16) for line in lines}
-    return set()
+    return {port for port, _ in udp_sockets()}
