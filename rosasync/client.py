@@ -6,7 +6,7 @@ import asyncio
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from rosasync.response_times import ResponseTimes
 
@@ -38,6 +38,19 @@ class Counts:
     late: int = 0
     retried: int = 0
     fast_retries: int = 0
+
+
+class _Abandoned(NamedTuple):
+    """A request that takes a place without a lease.
+
+    Attributes:
+        grace_ends: the loop time at which its place is given back in any case, infinite while its
+            call is in flight.
+        servers: the servers that have had it, None if they are not known yet.
+    """
+
+    grace_ends: float
+    servers: Servers | None
 
 
 class ClientOwner(Protocol):
@@ -87,6 +100,7 @@ class Client:
     __slots__ = (
         "_abandoned",
         "_grace",
+        "_late",
         "_loop",
         "_on_capacity",
         "_owner",
@@ -95,7 +109,6 @@ class Client:
         "_response_times",
         "_retried",
         "_silent_since",
-        "_superseded",
         "_timed",
         "_timed_at",
         "_timer",
@@ -125,11 +138,9 @@ class Client:
         self._owner = owner
         self._on_capacity = owner.on_capacity
         self.unanswered: dict[int, Call] = {}
-        # With the end of each grace period, infinite while the call is in flight, and the servers
-        # that the graph showed at the send.
-        self._abandoned: dict[int, tuple[float, Servers | None]] = {}
+        self._abandoned: dict[int, _Abandoned] = {}
         # Requests that take no place, with the timers that end the wait for their late responses.
-        self._superseded: dict[int, asyncio.TimerHandle] = {}
+        self._late: dict[int, asyncio.TimerHandle] = {}
         # The retried calls in flight, and those of them that wait to be sent again.
         self._retried: dict[Attempts, None] = {}
         self._resends: dict[Attempts, None] = {}
@@ -212,9 +223,9 @@ class Client:
         self.closed = True
         if self._timer is not None:
             self._timer.cancel()
-        for timer in self._superseded.values():
+        for timer in self._late.values():
             timer.cancel()
-        self._superseded.clear()
+        self._late.clear()
         self._abandoned.clear()
         self._port.close()
 
@@ -240,21 +251,23 @@ class Client:
         for call in self.unanswered.values():
             if call.servers is None:
                 call.servers = servers
-        for number, (ends, known) in self._abandoned.items():
-            if known is None:
-                self._abandoned[number] = ends, servers
+        for number, request in self._abandoned.items():
+            if request.servers is None:
+                self._abandoned[number] = request._replace(servers=servers)
 
     def free_predecessors(self, servers: Servers) -> None:
         """Free the places of the abandoned requests that one of these servers has not had."""
         earlier = [
-            number for number, (_, known) in self._abandoned.items() if known and servers - known
+            number
+            for number, request in self._abandoned.items()
+            if request.servers and servers - request.servers
         ]
-        self._free(earlier)
+        self._free_places(earlier)
 
     def has_lost(self, servers: Servers) -> bool:
         """Return whether there is a request whose servers are all gone."""
         outstanding = [call.servers for call in self.unanswered.values()]
-        outstanding += [known for _, known in self._abandoned.values()]
+        outstanding += [request.servers for request in self._abandoned.values()]
         return any(_is_lost(known, servers) for known in outstanding)
 
     def fail_lost(self, servers: Servers, error: Callable[[], Exception]) -> None:
@@ -270,8 +283,8 @@ class Client:
                 del self.unanswered[number]
                 self._port.forget(number)
                 calls[call] = None
-        for number, (_, known) in tuple(self._abandoned.items()):
-            if _is_lost(known, servers):
+        for number, request in tuple(self._abandoned.items()):
+            if _is_lost(request.servers, servers):
                 del self._abandoned[number]
                 self._port.forget(number)
         for call in calls:
@@ -292,27 +305,27 @@ class Client:
             return
         if sequence_number < self.answered or (servers and self.servers and self.servers - servers):
             self._abandoned.pop(sequence_number, None)
-            self.leave(sequence_number)
+            self.expect_late(sequence_number)
             return
         self._watch_silence()
         in_flight = sequence_number in self.unanswered
-        ends = math.inf if in_flight else self._loop.time() + self._grace
-        self._abandoned[sequence_number] = ends, servers
+        grace_ends = math.inf if in_flight else self._loop.time() + self._grace
+        self._abandoned[sequence_number] = _Abandoned(grace_ends, servers)
         self.start_timer()
 
     def has_place(self, sequence_number: int) -> bool:
         """Return whether a request takes a place without a lease."""
         return sequence_number in self._abandoned
 
-    def leave(self, sequence_number: int) -> None:
+    def expect_late(self, sequence_number: int) -> None:
         """Expect a late response for the grace period, without a place for it."""
         if self.closed or self._loop.is_closed():
             return
         # A retried call leaves an attempt whose place was given up before.
-        if earlier := self._superseded.get(sequence_number):
+        if earlier := self._late.get(sequence_number):
             earlier.cancel()
         timer = self._loop.call_later(self._grace, self._forget, sequence_number)
-        self._superseded[sequence_number] = timer
+        self._late[sequence_number] = timer
 
     def time_response(self, sequence_number: int) -> None:
         """Measure the response time of the request just sent, unless another is being measured."""
@@ -376,7 +389,7 @@ class Client:
             call.future.set_result(response)
         if call is not None:
             call.end()
-        elif (timer := self._superseded.pop(sequence_number, None)) is not None:
+        elif (timer := self._late.pop(sequence_number, None)) is not None:
             timer.cancel()
         if self._abandoned or self._retried:
             self._note_answer(sequence_number)
@@ -388,9 +401,9 @@ class Client:
         earlier = [number for number in self._abandoned if number < sequence_number]
         for attempts in tuple(self._retried):
             attempts.note_answer(sequence_number)
-        self._free(earlier, answered)
+        self._free_places(earlier, answered)
 
-    def _free(self, sequence_numbers: list[int], freed: bool = False) -> None:
+    def _free_places(self, sequence_numbers: list[int], freed: bool = False) -> None:
         """Free the places of abandoned requests; report it, too, if others were freed."""
         for number in sequence_numbers:
             self._give_up(number)
@@ -400,14 +413,14 @@ class Client:
     def _give_up(self, sequence_number: int) -> None:
         del self._abandoned[sequence_number]
         if sequence_number not in self.unanswered:
-            self.leave(sequence_number)
+            self.expect_late(sequence_number)
 
     def _places_freed(self) -> None:
         self.send_resends()
         self._on_capacity()
 
     def _forget(self, sequence_number: int) -> None:
-        del self._superseded[sequence_number]
+        del self._late[sequence_number]
         self._port.forget(sequence_number)
 
     def _watch_silence(self) -> None:
@@ -416,7 +429,7 @@ class Client:
 
     def start_timer(self) -> None:
         """Wait until a place may be given up. Call it if a caller has begun to wait for one."""
-        due = min((ends for ends, _ in self._abandoned.values()), default=math.inf)
+        due = min((request.grace_ends for request in self._abandoned.values()), default=math.inf)
         if self._is_place_wanted():
             due = min(due, self._silent_since + self._response_times.patience)
         if self._timer is not None and self._timer_due > due:
@@ -443,9 +456,10 @@ class Client:
         return bool(self._resends) or (bool(self._abandoned) and self._owner.has_callers())
 
     def _end_grace(self, now: float) -> None:
-        for number in [number for number, (ends, _) in self._abandoned.items() if ends <= now]:
-            del self._abandoned[number]
-            self._port.forget(number)
+        for number, request in tuple(self._abandoned.items()):
+            if request.grace_ends <= now:
+                del self._abandoned[number]
+                self._port.forget(number)
 
     def _give_up_place(self) -> None:
         if self._abandoned:

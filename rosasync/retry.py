@@ -196,7 +196,7 @@ class Attempts:
             if sequence_number == self._sent[-1] or client.has_place(sequence_number):
                 client.abandon(sequence_number, self.call.servers)
             else:
-                client.leave(sequence_number)
+                client.expect_late(sequence_number)
         del self.call  # Break the reference cycle.
 
     def _start_timer(self) -> None:

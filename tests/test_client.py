@@ -70,7 +70,7 @@ async def test_a_closed_client_starts_no_timer_for_a_late_response() -> None:
     under_test.client.close()
     loop = asyncio.get_running_loop()
     before = len(loop._scheduled)  # type: ignore[attr-defined]
-    under_test.client.leave(1)
+    under_test.client.expect_late(1)
     assert len(loop._scheduled) == before  # type: ignore[attr-defined]
 
 
@@ -155,11 +155,11 @@ async def test_close_is_idempotent_and_leaves_no_timer() -> None:
     assert repr(tested.client) == "<Client closed, 0 leases, 0 abandoned>"
 
 
-async def test_a_request_that_leaves_twice_is_forgotten_once() -> None:
+async def test_a_request_expected_late_twice_is_forgotten_once() -> None:
     under_test = ClientUnderTest(grace=TICK)
     with reports() as reported:
         for _ in range(2):
-            under_test.client.leave(1)
+            under_test.client.expect_late(1)
         forgotten: list[int] = []
 
         def forget(sequence_number: int) -> None:
