@@ -22,6 +22,7 @@ from rosasync.mismatch import MismatchReporter
 from rosasync.ports import PortDestroyed
 from rosasync.retry import Attempts, RetryBudget
 from rosasync.statistics import KeyStatistics
+from rosasync.tracing import ClientTracing
 
 if TYPE_CHECKING:
     from rosasync.graph_watch import GraphWatch
@@ -34,8 +35,8 @@ __all__ = ["MATCH_TIMEOUT", "ServicePool"]
 OnClient = Callable[[Client], None]
 """Called with the client when one is granted."""
 
-GONE_DELAY = 0.02
-"""Seconds to wait for responses that the last server sent just before it vanished."""
+GONE_DELAY = 0.05
+"""Seconds to wait for the next response that the last server sent just before it vanished."""
 MATCH_TIMEOUT = 1.0
 """Seconds to wait until a new client is matched with a server that the graph already shows."""
 
@@ -67,6 +68,7 @@ class ServicePool:
         self._watch = watch
         self._deadlines = deadlines
         self._tracing = tracing
+        self._traces = ClientTracing(tracing, service.key)
         self._loop = asyncio.get_running_loop()
         self._errors = CallErrors(service, node)
         self._clients = ClientSet(service, node, limits, watch, self._errors, self)
@@ -75,8 +77,6 @@ class ServicePool:
         self._queue: OrderedDict[asyncio.Future[Any], OnClient] = OrderedDict()
         # Each caller who waits for a match, with the client to be matched: None for any client.
         self._ready_waiters: dict[asyncio.Future[None], Client | None] = {}
-        # The traced calls that wait for a server.
-        self._unmatched: dict[CallTrace, None] = {}
         self._dispatch_scheduled = False
         # Started when the last server has vanished; ends the requests after GONE_DELAY.
         self._gone_timer: asyncio.TimerHandle | None = None
@@ -157,7 +157,7 @@ class ServicePool:
         now = monotonic_ns()
         trace = None
         if now >= self._tracing.quiet_until:
-            trace = self._tracing.start(self.service.key, now)
+            trace = self._traces.start(now)
         started = loop.time()
         deadline = None if timeout is None else started + timeout
         attempts = None if retry is None else Attempts(retry, self._budget)
@@ -175,7 +175,7 @@ class ServicePool:
                     call.start(client)
                 else:
                     if trace is not None:
-                        self._trace_wait(trace, self._clients.lacks_server)
+                        self._traces.wait(trace, self._clients.lacks_server)
                     if not wait:
                         await self._check_server(started, deadline)
                     self._enqueue(call.future, call.start)
@@ -185,6 +185,7 @@ class ServicePool:
         except BaseException as error:
             raise self._count_failure(call, error, started) from None
         finally:
+            # Not a method of `Deadlines`, because every call comes here.
             if entry is not None:
                 entry[-1] = None
             if call.in_flight:
@@ -194,7 +195,7 @@ class ServicePool:
         self._counts.completed += 1
         self.latencies.add(monotonic_ns() - now)
         if trace is not None:
-            self._end_trace(trace, "answered")
+            self._traces.end(trace, "answered")
         return response
 
     async def lease(self, timeout: float | None) -> Client:
@@ -296,15 +297,13 @@ class ServicePool:
         self._mismatch.check(self.awaits_match, self._loop.time())
         outstanding = self._clients.is_outstanding
         if outstanding and self._gone_timer is None and self._clients.find_lost_requests():
-            self._gone_timer = self._loop.call_later(GONE_DELAY, self._end_requests)
+            self._end_requests_later()
 
     # For the clients.
 
     def on_matched(self) -> None:
         """Report to the traced calls that a client is matched: from now on they are queued."""
-        waiting, self._unmatched = self._unmatched, {}
-        for trace in waiting:
-            trace.enter("queued")
+        self._traces.on_matched()
 
     def on_capacity(self) -> None:
         """Schedule a dispatch if callers wait."""
@@ -424,7 +423,7 @@ class ServicePool:
             self._ready_waiters[waiter] = leased
             if trace is not None and leased is not None:
                 matched = leased.matched_generation == self._watch.generation
-                self._trace_wait(trace, not matched)
+                self._traces.wait(trace, not matched)
             self._watch.poll_soon()
             self._clients.request_place()
             try:
@@ -456,25 +455,20 @@ class ServicePool:
         left = math.inf if deadline is None else max(0.0, deadline - now)
         await self.wait_for_server(min(MATCH_TIMEOUT, left))
 
-    # Tracing.
-
-    def _trace_wait(self, trace: CallTrace, for_server: bool) -> None:
-        if for_server:
-            self._unmatched[trace] = None
-        trace.enter("waiting" if for_server else "queued")
-
-    def _end_trace(
-        self, trace: CallTrace, outcome: Outcome, error: BaseException | None = None
-    ) -> None:
-        self._unmatched.pop(trace, None)
-        trace.end(outcome, error)
-
     # Failures.
 
-    def _end_requests(self) -> None:
+    def _end_requests_later(self) -> None:
+        completed = self._counts.completed
+        self._gone_timer = self._loop.call_later(GONE_DELAY, self._end_requests, completed)
+
+    def _end_requests(self, completed: int) -> None:
         self._gone_timer = None
         with self._watch.reports_shutdown():
-            self._clients.fail_lost(_Gone)
+            if self._counts.completed > completed and self._clients.servers_gone():
+                # The executor's thread takes responses one by one: more may be on their way.
+                self._end_requests_later()
+            else:
+                self._clients.fail_lost(_Gone)
 
     def _unreached(self, started: float) -> Exception:
         """Make the error for a deadline that passed before the request was sent."""
@@ -506,7 +500,7 @@ class ServicePool:
             outcome = "failed"
             counts.failed += 1
         if call.trace is not None:
-            self._end_trace(call.trace, outcome, error)
+            self._traces.end(call.trace, outcome, error)
         return error
 
     def _translate(self, call: Call, error: BaseException, started: float) -> BaseException:

@@ -21,6 +21,7 @@ __all__ = [
     "CallEnd",
     "CallPhase",
     "CallTrace",
+    "ClientTracing",
     "Outcome",
     "Phase",
     "ServerTrace",
@@ -159,11 +160,6 @@ class Tracing:
         self._hooks: tuple[Trace, ...] = () if hook is None else (hook,)
         self._log = _LogTrace()
 
-    def start(self, key: ServiceKey, now: int) -> CallTrace | None:
-        """Start the trace of a client's call, if something listens."""
-        listeners = self.listeners(now)
-        return CallTrace(listeners, _traced_call("client", key, now)) if listeners else None
-
     def listeners(self, now: int) -> tuple[Trace, ...]:
         """Return what listens to a call that starts now."""
         if logger.isEnabledFor(logging.DEBUG):
@@ -219,6 +215,43 @@ class CallTrace:
         except (Exception, asyncio.CancelledError):
             logger.exception("%s: the trace hook %r failed", self._call.srv_name, method)
             return None
+
+
+class ClientTracing:
+    """The traces of the calls of one service. Confined to the loop's thread.
+
+    Args:
+        tracing: the session's.
+        key: the service.
+    """
+
+    def __init__(self, tracing: Tracing, key: ServiceKey) -> None:
+        self._tracing = tracing
+        self._key = key
+        # Those whose calls wait for a server.
+        self._unmatched: dict[CallTrace, None] = {}
+
+    def start(self, now: int) -> CallTrace | None:
+        """Start the trace of a call, if something listens."""
+        listeners = self._tracing.listeners(now)
+        return CallTrace(listeners, _traced_call("client", self._key, now)) if listeners else None
+
+    def wait(self, trace: CallTrace, for_server: bool) -> None:
+        """Begin the wait for a server, or for a place."""
+        if for_server:
+            self._unmatched[trace] = None
+        trace.enter("waiting" if for_server else "queued")
+
+    def on_matched(self) -> None:
+        """Let the calls that waited for a server wait for a place, because a client is matched."""
+        waiting, self._unmatched = self._unmatched, {}
+        for trace in waiting:
+            trace.enter("queued")
+
+    def end(self, trace: CallTrace, outcome: Outcome, error: BaseException | None = None) -> None:
+        """End the trace of a call."""
+        self._unmatched.pop(trace, None)
+        trace.end(outcome, error)
 
 
 class ServerTrace(CallTrace):

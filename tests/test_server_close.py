@@ -60,6 +60,22 @@ class TestClose:
         assert server.statistics().responded == 5
         assert session.statistics().servers == ()
 
+    async def test_all_answers_arrive_that_were_sent_before_the_end(self, session: Session) -> None:
+        """The last ones were lost if the executor's thread was too busy to take them at once."""
+        gate = asyncio.Event()
+
+        async def handler(call: AnyCall) -> Any:
+            await gate.wait()
+            return echo_of(call.request)
+
+        server = session.serve(ECHO, "/served", handler, concurrency=5)
+        tasks = [ask(session, "/served", str(n)) for n in range(5)]
+        await until(lambda: server.statistics().taken == 5)
+        session.node.create_timer(TICK / 50, lambda: time.sleep(TICK / 2))
+        gate.set()
+        await server.aclose()
+        assert await asyncio.gather(*tasks) == [str(n) for n in range(5)]
+
     async def test_the_rest_is_cancelled_after_the_deadline(
         self, session: Session, caplog: pytest.LogCaptureFixture
     ) -> None:
