@@ -1,5 +1,7 @@
 """The Fast DDS profile that makes services repair lost packets after 20 ms instead of 3 s.
 
+On Jazzy it also moves the middleware's errors from stdout to stderr, where Kilted has them.
+
 Fast DDS repairs a lost packet when the writer's next heartbeat shows the reader the gap, and sends
 heartbeats every 3 s. rmw_fastrtps creates writers of requests with the profile named ``client``
 and those of responses with the profile named ``service``, so a profile with these two names
@@ -46,8 +48,16 @@ SKIP_FILE = "SKIP_DEFAULT_XML_FILE"
 NAMES = ("client", "service")
 
 PROFILE = """<?xml version="1.0" encoding="UTF-8"?>
-<profiles xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
+<dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
+<profiles>
 {profiles}</profiles>
+{log}</dds>
+"""
+LOG = """<!-- The middleware's errors: to stderr instead of stdout. -->
+<log><use_default>FALSE</use_default><consumer>
+  <class>StdoutErrConsumer</class>
+  <property><name>stderr_threshold</name><value>Log::Kind::Error</value></property>
+</consumer></log>
 """
 WRITER = """  <!-- {what}: repair a lost packet after {milliseconds} ms instead of 3 s. -->
   <publisher profile_name="{name}"><times><{tag}>
@@ -102,7 +112,7 @@ def profile_text(
     ]
     if announcement is not None:
         profiles.append(PARTICIPANT.format(**_duration(announcement)))
-    return PROFILE.format(profiles="".join(profiles))
+    return PROFILE.format(profiles="".join(profiles), log=LOG if old else "")
 
 
 def user_profile(old: bool) -> Path | None:

@@ -17,6 +17,7 @@ import pytest
 from benchmarks.hosts import NoHosts
 from benchmarks.lossy import LossyHosts
 from rosasync import profile
+from tests.support.program import as_root, own_shared_memory
 from tests.support.times import LIMIT, TICK, until
 
 ROOT = Path(__file__).parents[1]
@@ -145,8 +146,21 @@ def print_profile(*options: str) -> subprocess.CompletedProcess[str]:
 @pytest.mark.parametrize("old", [True, False])
 def test_nothing_but_services_is_touched(old: bool) -> None:
     root = ElementTree.fromstring(profile.profile_text(old))
-    names = [(element.tag.rpartition("}")[2], element.get("profile_name")) for element in root]
+    (profiles, *log) = root
+    names = [(element.tag.rpartition("}")[2], element.get("profile_name")) for element in profiles]
     assert names == [("publisher", "client"), ("publisher", "service")]
+    assert [element.tag.rpartition("}")[2] for element in log] == ["log"] * old
+
+
+@as_root
+def test_the_middleware_reports_errors_on_stderr() -> None:
+    code = "import asyncio, rosasync\n"
+    code += "async def main():\n async with rosasync.Session(): print('opened')\n"
+    code += "asyncio.run(main())"
+    command = [*own_shared_memory("16k"), sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT)
+    assert done.stdout == "opened\n"
+    assert "RTPS_TRANSPORT_SHM" in done.stderr
 
 
 def test_an_unreadable_profile_is_reported(

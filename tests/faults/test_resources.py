@@ -7,16 +7,8 @@ the next participant.
 
 from __future__ import annotations
 
-import os
-
-import pytest
-
 from tests.faults.trial import Trial
-from tests.support.program import run_program
-
-as_root = pytest.mark.skipif(
-    os.geteuid() != 0, reason="needs root, to mount a small /dev/shm or to give up its privileges"
-)
+from tests.support.program import as_root, own_shared_memory, run_program
 
 SHARED = """
 import contextlib, gc, os, resource, subprocess, tempfile
@@ -132,12 +124,6 @@ async def test_no_shared_memory(trial: Trial) -> None:
 async def test_shared_memory_that_a_dead_process_left_unfinished(trial: Trial) -> None:
     """Fast DDS waits for it for ever (Fast-DDS issue 3878)."""
     await _run(trial, UNFINISHED, *own_shared_memory("64m"))
-
-
-def own_shared_memory(size: str) -> tuple[str, ...]:
-    """Return the beginning of a command line: what it starts has a ``/dev/shm`` of its own."""
-    mount = f'mount -t tmpfs -o size={size} tmpfs /dev/shm && exec "$@"'
-    return ("unshare", "--mount", "sh", "-c", mount, "sh")
 
 
 async def _run(trial: Trial, program: str, *prefix: str) -> None:

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import subprocess
 import sys
 from collections.abc import Sequence
 
+import pytest
+
 from tests.support.process import ROOT
 from tests.support.times import LIMIT, TICK
 
-__all__ = ["run_program"]
+__all__ = ["as_root", "own_shared_memory", "run_program"]
+
+as_root = pytest.mark.skipif(
+    os.geteuid() != 0, reason="needs root, to mount a small /dev/shm or to give up its privileges"
+)
 
 BEGINNING = """
 import asyncio, sys, warnings
@@ -64,3 +71,9 @@ async def run_program(
     text = errors.decode()
     assert "terminate called" not in text
     return process.returncode, text
+
+
+def own_shared_memory(size: str) -> tuple[str, ...]:
+    """Return the beginning of a command line: what it starts has a ``/dev/shm`` of its own."""
+    mount = f'mount -t tmpfs -o size={size} tmpfs /dev/shm && exec "$@"'
+    return ("unshare", "--mount", "sh", "-c", mount, "sh")
