@@ -24,7 +24,7 @@ from typing import IO, Any, AnyStr, Self
 
 from tests.support.times import LIMIT
 
-__all__ = ["Child", "ChildError", "ended", "profile", "serve_commands"]
+__all__ = ["Child", "ChildError", "Unanswered", "ended", "profile", "serve_commands"]
 
 ROOT = Path(__file__).parents[2]
 SHARED_MEMORY = Path("/dev/shm")
@@ -42,14 +42,16 @@ _PROFILE_VARIABLE = (
     else "FASTDDS_DEFAULT_PROFILES_FILE"
 )
 
-# Every test opens new sessions. A process that announces itself every 0.2 s instead of every 3 s is
-# found at once, even by a session that replaces another. A response waits up to 3 s for
-# its client to be matched: if a discovery packet is lost, the usual 0.1 s is not enough.
+# Every test opens new sessions. A process that announces itself twice a second instead of every
+# 3 s is found at once, even by a session that replaces another. Not more often: Fast DDS can
+# deadlock if an announcement is due while a peer's endpoint is removed
+# (https://github.com/eProsima/Fast-DDS/issues/6502). A response waits up to 3 s for its client to
+# be matched: if a discovery packet is lost, the usual 0.1 s is not enough.
 _PROFILE = """<?xml version="1.0" encoding="UTF-8" ?>
 <profiles xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
   <participant profile_name="child" is_default_profile="true"><rtps><builtin><discovery_config>
     <leaseDuration><sec>{seconds}</sec></leaseDuration>
-    <leaseAnnouncement><sec>0</sec><nanosec>200000000</nanosec></leaseAnnouncement>
+    <leaseAnnouncement><sec>0</sec><nanosec>{announcement}</nanosec></leaseAnnouncement>
   </discovery_config></builtin></rtps></participant>
   <publisher profile_name="service"><qos><reliability>
     <max_blocking_time><sec>3</sec></max_blocking_time>
@@ -63,7 +65,8 @@ def profile(lease: int = 20) -> Iterator[dict[str, str]]:
     """Write the middleware's profile for a child; yield the variable that names it."""
     with TemporaryDirectory() as folder:
         file = Path(folder) / "profile.xml"
-        file.write_text(_PROFILE.format(seconds=lease))
+        announcement = min(lease * 200_000_000, 500_000_000)
+        file.write_text(_PROFILE.format(seconds=lease, announcement=announcement))
         yield {_PROFILE_VARIABLE: str(file)}
 
 
@@ -84,6 +87,10 @@ def ended(process: subprocess.Popen[AnyStr]) -> Iterator[subprocess.Popen[AnyStr
 
 class ChildError(Exception):
     """An exception in the child, with its traceback."""
+
+
+class Unanswered(AssertionError):
+    """A child did not answer a command, and was ended."""
 
 
 class Child:
@@ -109,17 +116,23 @@ class Child:
         environment: Mapping[str, str] | None = None,
     ) -> None:
         self._lock = threading.Lock()
-        with profile(lease) as variables:
+        self._command = [*prefix, sys.executable, "-X", "faulthandler", "-m", self.module, *args]
+        self._lease = lease
+        self._environment = dict(environment or {})
+        self._start()
+
+    def _start(self) -> None:
+        with profile(self._lease) as variables:
             reading, writing = os.pipe()
             self._answers = os.fdopen(reading, "rb")
             try:
                 self._process = subprocess.Popen(
-                    [*prefix, sys.executable, "-X", "faulthandler", "-m", self.module, *args],
+                    self._command,
                     stdin=subprocess.PIPE,
                     stdout=STDERR,
                     pass_fds=(writing,),
                     cwd=ROOT,
-                    env=os.environ | variables | {ANSWERS: str(writing)} | dict(environment or {}),
+                    env=os.environ | variables | {ANSWERS: str(writing)} | self._environment,
                 )
             finally:
                 os.close(writing)
@@ -148,6 +161,10 @@ class Child:
 
         A child that does not answer is ended, and its threads' stacks go to stderr: the next test
         gets another.
+
+        Raises:
+            Unanswered: the child did not answer.
+            ChildError: the command raised.
         """
         with self._lock:
             self._stdin.write(json.dumps({"do": command, "with": arguments}).encode() + b"\n")
@@ -155,7 +172,7 @@ class Child:
             ready, _, _ = select.select([self._answers], [], [], 4 * LIMIT)
             if not ready:
                 self.kill(stacks=True)
-                raise AssertionError(f"{self.module} did not answer {command!r}")
+                raise Unanswered(f"{self.module} did not answer {command!r}")
             line = self._answers.readline()
         if not line:
             with suppress(subprocess.TimeoutExpired):
@@ -171,6 +188,16 @@ class Child:
     async def ask(self, command: str, **arguments: Any) -> Any:
         """Send a command and wait for the answer without blocking the loop."""
         return await asyncio.to_thread(self.ask_now, command, **arguments)
+
+    def restart(self) -> None:
+        """Start it again after it was `Unanswered`.
+
+        For the first command that a test gives a stock process. Fast DDS may wait forever for a
+        port in shared memory whose creator was killed, or for itself
+        (https://github.com/eProsima/Fast-DDS/issues/3878 and 6502).
+        """
+        assert self.stock
+        self._start()
 
     def kill(self, *, stacks: bool = False) -> None:
         """End it as a crash does (SIGKILL), and remove the shared memory it leaves behind.

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from tests.support.echo import ECHO, fill, response_to, service_class
-from tests.support.process import Child, ended, profile, serve_commands
+from tests.support.process import Child, Unanswered, ended, profile, serve_commands
 from tests.support.times import LIMIT
 
 __all__ = ["Delay", "Misbehaviour", "ServerProcess", "running"]
@@ -61,6 +61,7 @@ class ServerProcess(Child):
 
     def __init__(self, node: str = "stock_server", **options: Any) -> None:
         super().__init__(node, **options)
+        self._serving = False
 
     async def serve(self, name: str, srv_type: str = ECHO, **options: Any) -> None:
         """Create a service without blocking the loop; the options are those of `serve_now`."""
@@ -88,16 +89,23 @@ class ServerProcess(Child):
             copies: how many services to create under this name.
             wrong: what it does wrong.
         """
-        self.ask_now(
-            "serve",
-            name=name,
-            srv_type=srv_type,
-            delay=delay,
-            skip=skip,
-            depth=depth,
-            copies=copies,
-            wrong=wrong,
-        )
+        arguments = {
+            "name": name,
+            "srv_type": srv_type,
+            "delay": delay,
+            "skip": skip,
+            "depth": depth,
+            "copies": copies,
+            "wrong": wrong,
+        }
+        try:
+            self.ask_now("serve", **arguments)
+        except Unanswered:
+            if self._serving:
+                raise
+            self.restart()
+            self.ask_now("serve", **arguments)
+        self._serving = True
 
     async def stop(self, name: str) -> None:
         """Destroy the services of this name."""
@@ -123,7 +131,12 @@ class ServerProcess(Child):
 
     async def clear(self) -> None:
         """Destroy all services and forget what they counted."""
-        await self.ask("clear")
+        await asyncio.to_thread(self.clear_now)
+
+    def clear_now(self) -> None:
+        """As `clear`; blocks."""
+        self.ask_now("clear")
+        self._serving = False
 
 
 class _Later:
