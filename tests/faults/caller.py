@@ -11,6 +11,7 @@ from typing import Any
 from rosasync import Limits, Session
 from tests.faults.table import Row
 from tests.faults.trial import PATIENT, Trial, resident_megabytes
+from tests.support.echo import ECHO, service_class
 from tests.support.process import Child, serve_commands
 from tests.support.times import LIMIT, TICK, until
 
@@ -76,6 +77,11 @@ class CallerProcess(Child):
                 raise AssertionError(f"less than {count} calls were answered: {state}")
             await asyncio.sleep(TICK)
 
+    async def finds_server(self, name: str) -> bool:
+        """Return whether a new stock client on the session's node is matched with a server."""
+        found: bool = await self.ask("finds_server", name=name)
+        return found
+
     async def stop(self) -> Row:
         """Let the calls end, make a last one, which has to be answered, and return the row."""
         return Row.from_json(await self.ask("stop"))
@@ -113,6 +119,16 @@ class _Callers:
             f"{self._trial.row}, {dict(self._trial.failed)}, {statistics}, "
             f"and last {self._trial.last_error!r}"
         )
+
+    def finds_server(self, name: str) -> bool:
+        assert self._session is not None
+        node = self._session.node
+        client = node.create_client(service_class(ECHO), name)
+        try:
+            found: bool = client.wait_for_service(LIMIT)
+            return found
+        finally:
+            node.destroy_client(client)
 
     def stop(self) -> str:
         self._stopped = True
@@ -197,7 +213,7 @@ class _Callers:
 
 def main() -> None:
     callers = _Callers()
-    commands = (callers.start, callers.answered, callers.state, callers.stop)
+    commands = (callers.start, callers.answered, callers.finds_server, callers.state, callers.stop)
     serve_commands({command.__name__: command for command in commands})
     callers.end()
 
