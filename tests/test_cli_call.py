@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from tests.support.command import LAMP, LAMP_TYPE, json_lines, own, rosasync, terminal
-from tests.support.process import ROOT, ended
+from tests.support.command import LAMP, LAMP_TYPE, json_lines, rosasync, terminal
+from tests.support.process import ROOT, ended, own
 from tests.support.servers import ServerProcess
 from tests.support.times import LIMIT
 

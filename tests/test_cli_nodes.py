@@ -16,9 +16,9 @@ import yaml
 
 from rosasync.cli.param import read_value
 from rosasync.parameters import ParameterType
-from tests.support.command import own, rosasync
+from tests.support.command import rosasync
 from tests.support.managed import NodesProcess
-from tests.support.process import ROOT
+from tests.support.process import ROOT, own
 from tests.support.times import LIMIT, TICK
 
 

@@ -26,7 +26,7 @@ from sybil.parsers.markdown import CodeBlockParser
 
 import rosasync
 from rosasync.ros.domain import isolate
-from tests.support.process import ROOT, ended, profile
+from tests.support.process import ROOT, ended, own, profile
 from tests.support.project import python_path
 from tests.support.servers import running
 from tests.support.times import LIMIT
@@ -148,10 +148,11 @@ def until_terminated(program: Path, expected: str) -> Iterator[None]:
     process = subprocess.Popen((sys.executable, str(program)), stdout=subprocess.PIPE, text=True)
     with ended(process):
         assert process.stdout is not None
-        first = process.stdout.readline()
+        while not (first := own(process.stdout.readline())) and process.poll() is None:
+            pass
         yield
         process.terminate()
-        rest = process.stdout.read()
+        rest = own(process.stdout.read())
         assert process.wait(LIMIT) == 0
     assert first + rest == expected
 
@@ -162,7 +163,7 @@ def shell(command: str, folder: Path) -> str:
     rosasync_command = f'rosasync() {{ "{sys.executable}" -m rosasync "$@"; }}; '
     with TemporaryDirectory() as site:
         variables = {"HOME": str(folder), "PATH": path, "PYTHONPATH": python_path(Path(site))}
-        return subprocess.run(
+        done = subprocess.run(
             ("bash", "-c", rosasync_command + command),
             cwd=folder,
             env=os.environ | variables,
@@ -170,12 +171,13 @@ def shell(command: str, folder: Path) -> str:
             text=True,
             timeout=120,
             check=False,
-        ).stdout
+        )
+    return own(done.stdout)
 
 
 def run(program: Path, environment: Mapping[str, str]) -> str:
     """Run a program as the page says, with warnings about unclosed things as errors."""
-    return subprocess.run(
+    done = subprocess.run(
         (sys.executable, "-W", "error::ResourceWarning", program.name),
         cwd=program.parent,
         env=os.environ | environment,
@@ -183,7 +185,8 @@ def run(program: Path, environment: Mapping[str, str]) -> str:
         text=True,
         timeout=120,
         check=True,
-    ).stdout
+    )
+    return own(done.stdout)
 
 
 def program_of(page: Path, name: str) -> str:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.process import ROOT
+from tests.support.process import ROOT, own
 from tests.support.times import LIMIT
 
 PROGRAM = """
@@ -41,7 +41,7 @@ def test_without_the_security_libraries_it_does_not_open(tmp_path: Path, strateg
         "ROS_SECURITY_STRATEGY": strategy,
         "ROS_SECURITY_KEYSTORE": str(tmp_path),
     }
-    output = subprocess.run(
+    done = subprocess.run(
         (sys.executable, "-c", PROGRAM),
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
@@ -50,5 +50,5 @@ def test_without_the_security_libraries_it_does_not_open(tmp_path: Path, strateg
         env=os.environ | environment,
         timeout=4 * LIMIT,
         check=True,
-    ).stdout
-    assert output == "refused: True\n"
+    )
+    assert own(done.stdout) == "refused: True\n"

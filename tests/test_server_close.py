@@ -332,8 +332,7 @@ class TestLastResponses:
         self, session: Session, client_process: ClientProcess
     ) -> None:
         server = session.serve(ECHO, "/served", echo_call)
-        await client_process.start("/served", 10)
-        assert (await client_process.result()).answered == 10
+        assert (await client_process.run("/served", 10)).answered == 10
         await until(server._port.delivered)
 
     async def test_nothing_is_asked_of_a_destroyed_service(self, session: Session) -> None:

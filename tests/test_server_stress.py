@@ -162,11 +162,11 @@ async def test_a_thousand_answers_from_four_threads(
                 # Longer than two heartbeats of 3 s, by which the middleware repairs a loss.
                 await process.start(name, 50, clients=5, in_flight=EACH, depth=1000, timeout=LIMIT)
             tallies = await asyncio.gather(*(process.result() for process in crowd))
+            assert tallies == [Tally(answered=250)] * PROCESSES
             await settled(server)
             statistics = server.statistics()
             assert statistics.taken == statistics.responded == 1000
             assert answerers.refused == statistics.dropped == 0
-            assert tallies == [Tally(answered=250)] * PROCESSES
 
 
 @pytest.mark.parametrize("round_", rounds(1, soak=3))

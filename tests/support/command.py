@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import shlex
 import subprocess
 import sys
@@ -15,14 +14,13 @@ from typing import Any
 import pexpect
 import pyte
 
-from tests.support.process import ROOT
+from tests.support.process import ROOT, own
 
-__all__ = ["LAMP", "LAMP_TYPE", "LIMIT", "Terminal", "json_lines", "own", "rosasync", "terminal"]
+__all__ = ["LAMP", "LAMP_TYPE", "LIMIT", "Terminal", "json_lines", "rosasync", "terminal"]
 
 LAMP, LAMP_TYPE = "/lamp/switch", "std_srvs/srv/SetBool"
 LIMIT = 120.0
 COLUMNS, LINES = 100, 30
-FAST_DDS = re.compile(r"^\S*\d{4}-\d\d-\d\d [\d:.]+ .*\[.*(RTPS|DDS|SHM).*-> Function ")
 
 
 def rosasync(*arguments: str, stdin: str = "", **environ: str) -> subprocess.CompletedProcess[str]:
@@ -39,11 +37,6 @@ def rosasync(*arguments: str, stdin: str = "", **environ: str) -> subprocess.Com
     )
     done.stderr = own(done.stderr)
     return done
-
-
-def own(stderr: str) -> str:
-    """Leave out the lines that Fast DDS logs, such as of a port locked by a killed process."""
-    return "".join(line for line in stderr.splitlines(True) if not FAST_DDS.search(line))
 
 
 def json_lines(text: str) -> list[Any]:

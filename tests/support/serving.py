@@ -142,7 +142,10 @@ async def settled(server: AnyServer) -> None:
         now = server.statistics()
         return now.running == now.waiting == now.unanswered == 0
 
-    await until(idle)
+    try:
+        await until(idle)
+    except AssertionError:
+        raise AssertionError(f"not settled: {server.statistics()}") from None
 
 
 class UnmatchedClients:
