@@ -275,6 +275,7 @@ SMALL_RUNS = {
 }
 
 
+@pytest.mark.slow
 def test_the_window_is_drawn(tmp_path: Path) -> None:
     plot = tmp_path / "window.svg"
     command = ("window", "--seconds=0.3", f"--plot={plot}")
@@ -282,6 +283,7 @@ def test_the_window_is_drawn(tmp_path: Path) -> None:
     assert "server killed" in plot.read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", SMALL_RUNS)
 def test_a_small_run(command: str, tmp_path: Path) -> None:
     file = tmp_path / "rows.json"

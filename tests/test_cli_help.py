@@ -66,6 +66,7 @@ def test_bad_usage_is_one_line_and_imports_no_rclpy(arguments: tuple[str, ...]) 
     assert "--help" in done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("lamp")
 @pytest.mark.parametrize("command", COMMANDS)
 def test_the_examples_of_the_help_work(command: str) -> None:

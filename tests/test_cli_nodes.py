@@ -156,6 +156,7 @@ async def run_example(example: str, folder: Path) -> None:
     assert (done.returncode, own(done.stderr)) == (0, ""), example
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("group", "kind", "node", "commands"),
     [

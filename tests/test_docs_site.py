@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import pytest
 from sphinx.search.en import SearchEnglish
 
 from tests.support.process import ROOT
@@ -123,6 +124,7 @@ def section_of(page: str, title: str) -> str:
     return section
 
 
+@pytest.mark.slow
 def test_the_site(tmp_path: Path) -> None:
     build = (sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "docs", str(tmp_path))
     done = subprocess.run(build, cwd=ROOT, stderr=subprocess.PIPE, text=True, timeout=300)
