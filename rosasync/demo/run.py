@@ -272,8 +272,10 @@ async def _stock_server() -> AsyncIterator[None]:
     assert process.stdin is not None
     assert process.stdout is not None
     try:
-        if await process.stdout.readline() != READY:
-            raise DemoError("the server process ended before it was ready")
+        # On Jazzy the middleware logs its errors there too.
+        while (line := await process.stdout.readline()) != READY:
+            if not line:
+                raise DemoError("the server process ended before it was ready")
         yield
     finally:
         process.stdin.close()

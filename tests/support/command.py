@@ -59,12 +59,12 @@ class Terminal:
             env={**os.environ, "TERM": "xterm", **environ},
             cwd=str(ROOT),
         )
-        self.raw = b""
+        self._raw = b""
 
     def wait_for(self, text: str) -> None:
         """Wait until the command has printed what this regular expression matches."""
         self._process.expect(text.encode())
-        self.raw += self._process.before + self._process.after
+        self._raw += self._process.before + self._process.after
 
     def interrupt(self) -> None:
         """Press Ctrl-C."""
@@ -77,10 +77,15 @@ class Terminal:
     def end(self) -> int:
         """Wait for the end, and return the exit code."""
         self._process.expect(pexpect.EOF)
-        self.raw += self._process.before
+        self._raw += self._process.before
         self._process.close()
         assert self._process.signalstatus is None
         return int(self._process.exitstatus)
+
+    @property
+    def raw(self) -> bytes:
+        """What the command has written to the terminal."""
+        return own(self._raw.decode(errors="surrogateescape")).encode(errors="surrogateescape")
 
     @property
     def screen(self) -> str:

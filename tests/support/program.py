@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from tests.support.process import ROOT
+from tests.support.process import ROOT, own
 from tests.support.times import LIMIT, TICK
 
 __all__ = ["as_root", "own_shared_memory", "run_program"]
@@ -68,7 +68,7 @@ async def run_program(
             process.kill()
             await process.wait()
     assert process.returncode is not None
-    text = errors.decode()
+    text = own(errors.decode())
     assert "terminate called" not in text
     return process.returncode, text
 
