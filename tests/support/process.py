@@ -76,8 +76,8 @@ def profile(lease: int = 20) -> Iterator[dict[str, str]]:
 def own(output: str) -> str:
     """Leave out the lines that Fast DDS logs, on stdout unless a profile says otherwise.
 
-    On a busy machine it takes a port in shared memory for dead although its process lives. Then
-    every new participant of the machine logs that it cannot lock the port, and takes another
+    On a busy machine a port in shared memory may be gone while its process still holds the lock.
+    Then every new participant of the machine logs that it cannot lock the port, and takes another
     (https://github.com/eProsima/Fast-DDS/issues/5737).
     """
     return "".join(line for line in output.splitlines(True) if not _LOGGED.search(line))
