@@ -26,7 +26,7 @@ from sybil.parsers.markdown import CodeBlockParser
 
 import rosasync
 from rosasync.ros.domain import isolate
-from tests.support.process import ROOT, ended, own, profile
+from tests.support.process import ROOT, ended, first_line, own, profile
 from tests.support.project import python_path
 from tests.support.servers import running
 from tests.support.times import LIMIT
@@ -148,8 +148,7 @@ def until_terminated(program: Path, expected: str) -> Iterator[None]:
     process = subprocess.Popen((sys.executable, str(program)), stdout=subprocess.PIPE, text=True)
     with ended(process):
         assert process.stdout is not None
-        while not (first := own(process.stdout.readline())) and process.poll() is None:
-            pass
+        first = first_line(process.stdout)
         yield
         process.terminate()
         rest = own(process.stdout.read())

@@ -17,7 +17,7 @@ import pytest
 from benchmarks.hosts import NoHosts
 from benchmarks.lossy import LossyHosts
 from rosasync import profile
-from tests.support.process import own
+from tests.support.process import first_line, own
 from tests.support.program import as_root, own_shared_memory
 from tests.support.times import LIMIT, TICK, until
 
@@ -56,9 +56,7 @@ def program(
         try:
             assert process.stdout is not None
             # What Fast DDS finds wrong in a profile comes before, and is not left out.
-            while not (line := own(process.stdout.readline())) and process.poll() is None:
-                pass
-            assert line == "ready\n"
+            assert first_line(process.stdout) == "ready\n"
             yield process
         finally:
             process.kill()

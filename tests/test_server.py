@@ -23,6 +23,7 @@ from rosasync.ros.services import take_requests
 from tests.support.echo import ECHO, answer_to
 from tests.support.serving import (
     AnyCall,
+    Gate,
     Holder,
     Response,
     ask,
@@ -88,11 +89,7 @@ class TestLimits:
         assert most == 3
 
     async def test_beyond_the_backlog_somebody_answers(self, session: Session) -> None:
-        gate = asyncio.Event()
-
-        async def handler(call: AnyCall) -> Any:
-            await gate.wait()
-            return echo_of(call.request)
+        gate = Gate()
 
         async def busy(call: AnyCall) -> Any:
             await asyncio.sleep(0)
@@ -102,7 +99,7 @@ class TestLimits:
             gate.clear()
             name = f"/served_{number}"
             server = session.serve(
-                ECHO, name, handler, concurrency=1, backlog=2, on_overload=on_overload
+                ECHO, name, gate, concurrency=1, backlog=2, on_overload=on_overload
             )
             tasks = [ask(session, name, str(n)) for n in range(5)]
             assert await asyncio.gather(*tasks[3:]) == ["busy", "busy"]
@@ -135,17 +132,13 @@ class TestLimits:
         await discard(*tasks[2:])
 
     async def test_beyond_the_backlog_in_bytes(self, session: Session) -> None:
-        gate = asyncio.Event()
-
-        async def handler(call: AnyCall) -> Any:
-            await gate.wait()
-            return echo_of(call.request)
+        gate = Gate()
 
         def busy(call: AnyCall) -> Any:
             return Response(message="busy")
 
         server = session.serve(
-            ECHO, "/served", handler, concurrency=1, backlog_bytes=100, on_overload=busy
+            ECHO, "/served", gate, concurrency=1, backlog_bytes=100, on_overload=busy
         )
         sizes = [60, 60, 60, 40, 1]
         tasks = [ask(session, "/served", "x" * size) for size in sizes]

@@ -25,6 +25,7 @@ from rosasync.ports import PortDestroyed
 from tests.support.echo import ECHO
 from tests.support.serving import (
     AnyCall,
+    Gate,
     Holder,
     Response,
     ask,
@@ -40,13 +41,9 @@ if TYPE_CHECKING:
 
 class TestClose:
     async def test_handlers_finish(self, session: Session) -> None:
-        gate = asyncio.Event()
+        gate = Gate()
 
-        async def handler(call: AnyCall) -> Any:
-            await gate.wait()
-            return echo_of(call.request)
-
-        server = session.serve(ECHO, "/served", handler, concurrency=2)
+        server = session.serve(ECHO, "/served", gate, concurrency=2)
         tasks = [ask(session, "/served", str(n)) for n in range(5)]
         await until(lambda: server.statistics().taken == 5)
         closing = [asyncio.create_task(server.aclose()) for _ in range(2)]
@@ -62,13 +59,9 @@ class TestClose:
 
     async def test_all_answers_arrive_that_were_sent_before_the_end(self, session: Session) -> None:
         """The last ones were lost if the executor's thread was too busy to take them at once."""
-        gate = asyncio.Event()
+        gate = Gate()
 
-        async def handler(call: AnyCall) -> Any:
-            await gate.wait()
-            return echo_of(call.request)
-
-        server = session.serve(ECHO, "/served", handler, concurrency=5)
+        server = session.serve(ECHO, "/served", gate, concurrency=5)
         tasks = [ask(session, "/served", str(n)) for n in range(5)]
         await until(lambda: server.statistics().taken == 5)
         session.node.create_timer(TICK / 50, lambda: time.sleep(TICK / 2))
@@ -101,13 +94,9 @@ class TestClose:
         assert sum("1 requests waiting" in message for message in caplog.messages) == 1
 
     async def test_no_request_is_taken_meanwhile(self, session: Session) -> None:
-        gate = asyncio.Event()
+        gate = Gate()
 
-        async def handler(call: AnyCall) -> Any:
-            await gate.wait()
-            return echo_of(call.request)
-
-        server = session.serve(ECHO, "/served", handler)
+        server = session.serve(ECHO, "/served", gate)
         task = ask(session, "/served", "first")
         await until(lambda: server.statistics().taken == 1)
         closing = asyncio.create_task(server.aclose())

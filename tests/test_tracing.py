@@ -35,6 +35,7 @@ from tests.support.echo import ECHO, answer_to, request_of
 from tests.support.serving import (
     FORMS,
     AnyCall,
+    Gate,
     Holder,
     Response,
     UnmatchedClients,
@@ -245,13 +246,9 @@ class TestRequests:
         assert phases == expected.get(form, "handling > answered")
 
     async def test_waiting_for_a_handler(self, traced: Session, trace: Recorder) -> None:
-        gate = asyncio.Event()
+        gate = Gate()
 
-        async def handler(call: AnyCall) -> Any:
-            await gate.wait()
-            return echo_of(call.request)
-
-        traced.serve(ECHO, "/served", handler, concurrency=1)
+        traced.serve(ECHO, "/served", gate, concurrency=1)
         tasks = [ask(traced, "/served", str(number)) for number in range(2)]
         await until(lambda: trace.of("server") == ["handling > ...", "queued > ..."])
         gate.set()

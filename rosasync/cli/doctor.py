@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import importlib.util
 import os
 import platform
@@ -10,8 +9,6 @@ import shutil
 import socket
 import sys
 import time
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 
 import rosasync
@@ -20,6 +17,7 @@ from rosasync.cli.errors import Code
 from rosasync.cli.options import AsJson
 from rosasync.cli.run import open_session, run
 from rosasync.cli.why import environment
+from rosasync.demo.server import stock_server
 from rosasync.profile import SWITCH, is_old, profile_variable, switched_off, user_profile
 from rosasync.ros.middleware import check_middleware, installed_middlewares
 from rosasync.ros.shared_memory import (
@@ -179,7 +177,7 @@ async def _calls(report: Report) -> None:
     async with open_session(DISCOVERY) as session:
         async with session.serve(SRV_TYPE, f"{name}/own", lambda _, response: response):
             await _try(report, session, "call to itself", f"{name}/own", {})
-        async with _server_process(f"{name}/other"):
+        async with stock_server(f"{name}/other"):
             await _try(report, session, "other process", f"{name}/other", {})
 
 
@@ -200,26 +198,3 @@ async def _try(
         report.add(
             check, True, f"discovered in {discovery:.2f} s{slow}, answered in {1e3 * call:.1f} ms"
         )
-
-
-@asynccontextmanager
-async def _server_process(name: str) -> AsyncIterator[None]:
-    """Run a stock server in its own process and session, so that Ctrl-C does not reach it."""
-    process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "rosasync.demo.stock", name),
-        stdin=asyncio.subprocess.PIPE,
-        stdout=asyncio.subprocess.PIPE,
-        start_new_session=True,
-    )
-    assert process.stdin is not None
-    assert process.stdout is not None
-    try:
-        await process.stdout.readline()
-        yield
-    finally:
-        process.stdin.close()
-        with suppress(TimeoutError):
-            await asyncio.wait_for(asyncio.shield(process.wait()), 2.0)
-        if process.returncode is None:
-            process.kill()
-            await process.wait()

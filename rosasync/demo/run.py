@@ -11,9 +11,9 @@ import statistics
 import sys
 import threading
 import time
-from collections.abc import AsyncIterator, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import asynccontextmanager, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING
 
@@ -23,6 +23,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 import rosasync
+from rosasync.demo.server import stock_server
 from rosasync.ros.domain import isolate
 
 if TYPE_CHECKING:
@@ -41,8 +42,8 @@ CALL_TIMEOUT = 3.0
 GREETINGS, GREETING_TIMEOUT = 6, 0.5
 """The most attempts at a first call, and seconds for each attempt."""
 
-START_LIMIT, END_LIMIT = 8.0, 1.5
-"""Seconds for the start, and for the server to end before it is killed."""
+START_LIMIT = 8.0
+"""Seconds for the start."""
 
 
 class DemoError(Exception):
@@ -231,8 +232,10 @@ async def _run(calls: int, seconds: float) -> Report:
     async with (
         asyncio.timeout(START_LIMIT + seconds),
         rosasync.Session("rosasync_demo", timeout=CALL_TIMEOUT) as session,
-        _stock_server(),
+        stock_server(*SRV_NAMES.values()) as ready,
     ):
+        if not ready:
+            raise DemoError("the server process ended before it was ready")
         from rosasync.demo.stock import Echo
 
         with _stock_client() as client, ThreadPoolExecutor(max(AT_ONCE)) as threads:
@@ -256,35 +259,6 @@ async def _greet(session: rosasync.Session, client: ThreadedClient) -> None:
             await asyncio.to_thread(client.call, greeting, GREETING_TIMEOUT)
             return
     raise DemoError(f"{STOCK} got no response")
-
-
-@asynccontextmanager
-async def _stock_server() -> AsyncIterator[None]:
-    """Run the server in its own process and session, so that Ctrl-C does not reach it."""
-    from rosasync.demo.stock import READY
-
-    process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "rosasync.demo.stock", *SRV_NAMES.values()),
-        stdin=asyncio.subprocess.PIPE,
-        stdout=asyncio.subprocess.PIPE,
-        start_new_session=True,
-    )
-    assert process.stdin is not None
-    assert process.stdout is not None
-    try:
-        # On Jazzy the middleware logs its errors there too.
-        while (line := await process.stdout.readline()) != READY:
-            if not line:
-                raise DemoError("the server process ended before it was ready")
-        yield
-    finally:
-        process.stdin.close()
-        try:
-            async with asyncio.timeout(END_LIMIT):
-                await process.wait()
-        except TimeoutError:
-            process.kill()
-            await process.wait()
 
 
 @contextmanager

@@ -48,7 +48,7 @@ class Network:
                 network._hosts = stack.enter_context(LossyHosts("one", "two", "client", seed=19))
             except NoHosts:
                 network._hosts = None
-            network._servers = [await network._server(host) for host in ("one", "two")]
+            network._servers = [await network._server(number) for number in (0, 1)]
             yield network
 
     async def caller(self) -> CallerProcess:
@@ -60,7 +60,7 @@ class Network:
         number = self.chance.randrange(2)
         await asyncio.to_thread(how, self._servers[number])
         await asyncio.sleep(self.chance.uniform(0, PAUSE))
-        self._servers[number] = await self._server(["one", "two"][number])
+        self._servers[number] = await self._server(number)
 
     async def partition(self) -> None:
         # Clearly shorter or clearly longer than the lease. In between, only one side may forget the
@@ -73,7 +73,7 @@ class Network:
         """Replace both servers."""
         for number in (0, 1):
             await asyncio.to_thread(self._servers[number].kill)
-            self._servers[number] = await self._server(["one", "two"][number])
+            self._servers[number] = await self._server(number)
 
     async def lose(self) -> None:
         await self._disturb(0.1, self.chance.uniform(0, 3 * PAUSE))
@@ -94,8 +94,8 @@ class Network:
             return {}
         return {"prefix": self._hosts.on(host), "environment": self._hosts.environment}
 
-    async def _server(self, host: str) -> ServerProcess:
-        server = ServerProcess(lease=LEASE, **self._on(host))
+    async def _server(self, number: int) -> ServerProcess:
+        server = ServerProcess(lease=LEASE, **self._on(["one", "two"][number]))
         await self._stack.enter_async_context(server)
         await server.serve(NAME)
         return server

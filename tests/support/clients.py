@@ -287,8 +287,8 @@ def _call_blocking(client: Any, text: str, timeout: float) -> Any:
 def _accepted(send: Callable[[], Any]) -> Any:
     """Send a request up to three times; None if the middleware refuses it.
 
-    On a busy machine the middleware may wait 0.1 s for its own locks or for acknowledgements, in
-    vain. It has not sent the request then.
+    On a busy machine the middleware may not get its own locks, or an acknowledgement, within 0.1 s.
+    It has not sent the request then.
     """
     from rclpy.impl.implementation_singleton import rclpy_implementation
 

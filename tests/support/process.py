@@ -16,7 +16,7 @@ import subprocess
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
@@ -25,7 +25,16 @@ from typing import IO, Any, AnyStr, Self
 
 from tests.support.times import LIMIT
 
-__all__ = ["Child", "ChildError", "Unanswered", "ended", "own", "profile", "serve_commands"]
+__all__ = [
+    "Child",
+    "ChildError",
+    "Unanswered",
+    "ended",
+    "first_line",
+    "own",
+    "profile",
+    "serve_commands",
+]
 
 ROOT = Path(__file__).parents[2]
 SHARED_MEMORY = Path("/dev/shm")
@@ -81,6 +90,11 @@ def own(output: str) -> str:
     (https://github.com/eProsima/Fast-DDS/issues/5737).
     """
     return "".join(line for line in output.splitlines(True) if not _LOGGED.search(line))
+
+
+def first_line(output: Iterable[str]) -> str:
+    """Read up to the first line that is the program's own; empty if there is none."""
+    return next((line for line in output if own(line)), "")
 
 
 @contextmanager

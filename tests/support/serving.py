@@ -21,6 +21,7 @@ __all__ = [
     "FORMS",
     "AnyCall",
     "AnyServer",
+    "Gate",
     "Holder",
     "Response",
     "UnmatchedClients",
@@ -61,6 +62,14 @@ async def discard(*tasks: asyncio.Task[Any]) -> None:
     for task in tasks:
         task.cancel()
     await asyncio.gather(*tasks, return_exceptions=True)
+
+
+class Gate(asyncio.Event):
+    """A handler that echoes once it is set."""
+
+    async def __call__(self, call: AnyCall) -> Any:
+        await self.wait()
+        return echo_of(call.request)
 
 
 class Holder:
