@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.pages import markdown_table
-from benchmarks.pipes import ROOT
+from benchmarks.pipes import ROOT, await_line
 from benchmarks.stock import StockServer
 from benchmarks.trials import Trials
 
@@ -21,6 +21,9 @@ __all__ = ["PROGRAMS", "Start", "check_programs", "draw", "heading", "measure", 
 
 COMMAND = "cold"
 NAME, TYPE = "/bench/cold", "std_srvs/srv/Empty"
+
+ANSWER = b"{}\n"
+"""The empty response, as `rosasync call` prints it."""
 
 STOCK = """\
 import rclpy
@@ -31,7 +34,7 @@ client = node.create_client(Empty, "/bench/cold")
 client.wait_for_service()
 future = client.call_async(Empty.Request())
 rclpy.spin_until_future_complete(node, future)
-print("answered", flush=True)
+print("{}", flush=True)
 node.destroy_node()
 rclpy.shutdown()
 """
@@ -42,7 +45,7 @@ from std_srvs.srv import Empty
 async def main():
     async with rosasync.Session("cold", timeout=30.0) as session:
         await session.call(Empty, "/bench/cold")
-        print("answered", flush=True)
+        print("{}", flush=True)
 asyncio.run(main())
 """
 
@@ -51,12 +54,12 @@ PROGRAMS = {
     "rosasync script": (sys.executable, "-c", ROSASYNC),
     "rosasync call": (sys.executable, "-m", "rosasync", "call", NAME, TYPE, "{}"),
 }
-"""The command of each program, which prints something once it has an answer."""
+"""The command of each program, which prints `ANSWER` once it has an answer."""
 
 
 @dataclass(frozen=True)
 class Start:
-    """One process: the seconds from its start to its first output, None if it had no answer."""
+    """One process: the seconds from its start to its answer, None if it had none."""
 
     program: str
     seconds: float | None
@@ -91,16 +94,16 @@ def measure(
 
 
 def _run(command: Sequence[str]) -> float | None:
-    """Run a process to its end; return the seconds until its first output, None if it failed."""
+    """Run a process to its end; return the seconds until its answer, None if it had none."""
     begin = time.monotonic()
     with subprocess.Popen(
         command, cwd=ROOT, env=os.environ, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
     ) as process:
         assert process.stdout is not None
-        process.stdout.readline()
+        answered = await_line(process.stdout, ANSWER)
         seconds = time.monotonic() - begin
         process.stdout.read()
-    return seconds if process.returncode == 0 else None
+    return seconds if answered and process.returncode == 0 else None
 
 
 heading = ["", "processes", "p50 s", "p95 s", "longest s", "no answer"]

@@ -17,13 +17,21 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import IO, Any
 
-__all__ = ["Child", "ChildError", "Hung", "answer_lines", "describe"]
+__all__ = ["READY", "Child", "ChildError", "Hung", "answer_lines", "await_line", "describe"]
 
 Message = dict[str, Any]
 
 ROOT = Path(__file__).resolve().parent.parent
+
+READY = b"ready\n"
+"""What a server's process prints on stdout once it serves."""
+
+
+def await_line(output: IO[bytes], line: bytes) -> bool:
+    """Read up to this line, past what the middleware logs; False if the output ends without it."""
+    return line in iter(output.readline, b"")
 
 
 class ChildError(Exception):

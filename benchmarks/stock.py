@@ -17,7 +17,7 @@ from types import TracebackType
 import rclpy
 from rclpy.executors import ExternalShutdownException
 
-from benchmarks.pipes import ROOT
+from benchmarks.pipes import READY, ROOT, await_line
 from benchmarks.work import Work, load_type, make_handler
 
 __all__ = ["StockServer"]
@@ -44,7 +44,7 @@ class StockServer:
             cwd=ROOT,
         )
         assert self._process.stdout is not None
-        self._process.stdout.readline()
+        await_line(self._process.stdout, READY)
 
     def interrupt(self) -> float:
         """Send SIGINT; return when, on the monotonic clock. It is gone once `close` returns."""
@@ -88,7 +88,7 @@ def main(srv_name: str, seconds: float) -> None:
     rclpy.init()
     node = rclpy.create_node("bench_stock")
     node.create_service(load_type(work.srv_type), srv_name, make_handler(work))
-    print("ready", flush=True)
+    os.write(sys.stdout.fileno(), READY)
     with suppress(KeyboardInterrupt, ExternalShutdownException):
         rclpy.spin(node)
     node.destroy_node()

@@ -19,6 +19,7 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 
 from benchmarks.contestants.base import spinning
+from benchmarks.pipes import READY, await_line
 from benchmarks.work import Work, load_type
 
 __all__ = ["stopping_server"]
@@ -34,7 +35,7 @@ def stopping_server(work: Work) -> Iterator[None]:
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         assert process.stdin is not None
         assert process.stdout is not None
-        process.stdout.readline()
+        await_line(process.stdout, READY)
         try:
             yield
         finally:
@@ -61,7 +62,7 @@ def main(srv_type: str, *srv_names: str) -> None:
     for srv_name in srv_names:
         node.create_service(load_type(srv_type), srv_name, stop)
     with spinning(node, SingleThreadedExecutor()):
-        print("ready", flush=True)
+        os.write(sys.stdout.fileno(), READY)
         sys.stdin.read()
 
 

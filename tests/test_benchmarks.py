@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 import subprocess
 import sys
@@ -15,7 +16,7 @@ from benchmarks import cold, commands, faults, hosts, pages, profile, sharing
 from benchmarks.contestants import CONTESTANTS, make_contestant
 from benchmarks.contestants.base import LoggedCall
 from benchmarks.meter import Usage
-from benchmarks.pipes import ROOT
+from benchmarks.pipes import READY, ROOT, await_line
 from benchmarks.report import write_report
 from benchmarks.results import Results, Turn
 from benchmarks.runner import Scenario
@@ -268,10 +269,18 @@ def test_a_report_keeps_the_marked_sections(tmp_path: Path) -> None:
     assert "former" not in page.read_text()
 
 
+def test_a_process_is_ready_at_its_own_line() -> None:
+    logged = b"2026-01-01 [RTPS_TRANSPORT_SHM Error] Failed init_port\n"
+    output = io.BytesIO(logged + READY + b"next\n")
+    assert await_line(output, READY)
+    assert output.read() == b"next\n"
+    assert not await_line(io.BytesIO(logged), READY)
+
+
 SMALL_RUNS = {
     "sharing": ("--contestants=direct,semaphore", "--processes=2", "--work=1", "--seconds=0.3"),
     "faults": ("--situations=slow server", "--contestants=direct-retry"),
-    "cold": ("--programs=stock rclpy script,rosasync script", "--processes=1"),
+    "cold": ("--processes=1",),
 }
 
 
