@@ -40,6 +40,7 @@ async def printed(*arguments: str) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 class TestParam:
     async def test_list(self, nodes: NodesProcess) -> None:
         node = await nodes.add("parameters", "arm")
@@ -176,6 +177,7 @@ async def test_the_examples_of_the_help(
             await run_example(example.replace(f" {node}", f" {name}"), tmp_path)
 
 
+@pytest.mark.slow
 class TestLifecycle:
     async def test_get_list_and_set(self, nodes: NodesProcess) -> None:
         node = await nodes.add("lifecycle")

@@ -230,6 +230,7 @@ def servers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Servers]:
     servers.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", pages(), ids=name_of)
 def test_the_page_works_as_written(page: Path, tmp_path: Path, servers: Servers) -> None:
     if EXAMPLES in page.parents:

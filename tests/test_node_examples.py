@@ -38,6 +38,7 @@ finalized
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("example", PRINTS)
 def test_example(example: str) -> None:
     node, printed = PRINTS[example]

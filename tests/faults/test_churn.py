@@ -121,7 +121,8 @@ async def _cancel_at_random(
 
     async def one() -> None:
         how = chance.randrange(3)
-        timeout = chance.uniform(0, TICK / 4) if how == 1 else 2 * LIMIT
+        # Not long: places come back so soon that requests are lost at a server that is held up.
+        timeout = chance.uniform(0, TICK / 4) if how == 1 else LIMIT / 4
         task = asyncio.create_task(trial.call(session, "/echo", timeout=timeout))
         await asyncio.sleep(0)
         if how == 2:

@@ -183,11 +183,16 @@ class Child:
         fields = Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()
         return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
-    def ask_now(self, command: str, **arguments: Any) -> Any:
+    def ask_now(self, command: str, *, patience: float = 4 * LIMIT, **arguments: Any) -> Any:
         """Send a command and block until the child has answered it.
 
         A child that does not answer is ended, and its threads' stacks go to stderr: the next test
         gets another.
+
+        Args:
+            command: the name of the command.
+            patience: seconds to wait for its answer.
+            arguments: those of the command.
 
         Raises:
             Unanswered: the child did not answer.
@@ -196,7 +201,7 @@ class Child:
         with self._lock:
             self._stdin.write(json.dumps({"do": command, "with": arguments}).encode() + b"\n")
             self._stdin.flush()
-            ready, _, _ = select.select([self._answers], [], [], 4 * LIMIT)
+            ready, _, _ = select.select([self._answers], [], [], patience)
             if not ready:
                 self.kill(stacks=True)
                 raise Unanswered(f"{self.module} did not answer {command!r}")

@@ -89,7 +89,7 @@ class ServerProcess(Child):
             copies: how many services to create under this name.
             wrong: what it does wrong.
         """
-        arguments = {
+        arguments: dict[str, Any] = {
             "name": name,
             "srv_type": srv_type,
             "delay": delay,
@@ -99,7 +99,7 @@ class ServerProcess(Child):
             "wrong": wrong,
         }
         try:
-            self.ask_now("serve", **arguments)
+            self.ask_now("serve", patience=4 * LIMIT if self._serving else LIMIT / 2, **arguments)
         except Unanswered:
             if self._serving:
                 raise
