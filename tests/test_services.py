@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from types import SimpleNamespace
 from typing import Any
 
@@ -21,7 +22,7 @@ from rosasync.ros.responder import (
     client_of,
 )
 from rosasync.service_call import RESEND
-from tests.support.times import LIMIT
+from tests.support.times import LIMIT, TICK
 
 BLOCKED = 0.1
 """Seconds for which the middleware waits for a client."""
@@ -247,6 +248,57 @@ def test_a_slow_send_to_a_visible_client_has_sent(
     for _ in range(3):
         service.send(Header(GOOD), "response")
     assert middleware.sent == [GOOD] * 3
+
+
+def test_a_send_that_fails_without_waiting_has_failed(
+    middleware: Middleware, service: Responder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A profile may set the time for which the middleware waits."""
+    middleware.report = "warning"
+    middleware.unmatched.add(GOOD)
+    monkeypatch.setattr("tests.test_services.BLOCKED", 0.0)
+    assert "not matched" in fail(service, GOOD)
+
+
+def test_a_failed_send_is_not_taken_for_that_of_another_thread(
+    middleware: Middleware, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """rclpy's warning does not say which send has failed."""
+    middleware.join(BAD)
+    begun, failed = threading.Event(), threading.Event()
+
+    def begin(self: Middleware) -> None:
+        if threading.current_thread() is other:
+            begun.set()
+            assert failed.wait(LIMIT)
+
+    def send(response: object, request_id: Header) -> None:
+        if request_id.client == BAD:
+            other.start()
+            begun.wait(TICK)
+            responder.__warningregistry__["version"] = 1
+            middleware.now += BLOCKED
+            failed.set()
+            # The other thread ends now, if it was let in.
+            other.join(TICK)
+        middleware.sent.append(request_id.client)
+
+    monkeypatch.setattr(Middleware, "__enter__", begin)
+    monkeypatch.setattr(middleware, "service_send_response", send)
+    service = Responder(middleware, middleware, VOLATILE)
+    errors: list[Exception] = []
+
+    def send_good() -> None:
+        try:
+            service.send(Header(GOOD), "response")
+        except Exception as error:
+            errors.append(error)
+
+    other = threading.Thread(target=send_good)
+    fail(service, BAD)
+    other.join(LIMIT)
+    assert errors == []
+    assert middleware.sent == [BAD, GOOD]
 
 
 def test_clients_that_left_are_forgotten(middleware: Middleware, service: Responder) -> None:

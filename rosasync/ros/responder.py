@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import struct
+import threading
 from collections import Counter
 from dataclasses import dataclass
 from time import monotonic
@@ -46,6 +47,10 @@ INFO = struct.Struct("<qq16sq")
 # But for every warning, before it applies the filters, CPython stores their version in the registry
 # of the module that warns. So a registry that is not empty shows that there was a warning.
 __warningregistry__: dict[Any, Any] = {}
+# Held from a send until the registry was looked at, because all threads share it. Reentrant,
+# because the garbage collector may run a __del__ that sends.
+_sends = threading.RLock()
+NOT_MATCHED = "the client was not matched in time"
 
 
 @dataclass(slots=True)
@@ -130,21 +135,28 @@ class Responder:
             ContextShutdown: the node is down.
         """
         unreached = self._check(header) if self._watching else None
-        started = monotonic()
-        try:
-            # It raises for a destroyed service even while an executor still holds it.
-            with self._handle:
-                self._send(response, header.request_id)
-        except RclpyError as error:
-            raise self._failure(error) from error
-        except SystemError as error:
-            # A filter has turned the warning into an error, which rclpy does not handle.
-            if not isinstance(error.__cause__, RuntimeWarning):
-                raise
-            __warningregistry__.clear()
-            self._fail(header, str(error.__cause__))
-        if monotonic() - started >= SLOW_SEND:
-            self._after_slow_send(header)
+        failure = None
+        with _sends:
+            started = monotonic()
+            try:
+                # It raises for a destroyed service even while an executor still holds it.
+                with self._handle:
+                    self._send(response, header.request_id)
+            except RclpyError as error:
+                raise self._failure(error) from error
+            except SystemError as error:
+                # A filter has turned the warning into an error, which rclpy does not handle.
+                if not isinstance(error.__cause__, RuntimeWarning):
+                    raise
+                failure = str(error.__cause__)
+            slow = monotonic() - started >= SLOW_SEND
+            if __warningregistry__:
+                __warningregistry__.clear()
+                failure = failure or NOT_MATCHED
+        if failure is not None:
+            self._fail(header, failure)
+        if slow:
+            self._check_visible(header)
         elif unreached is not None:
             self._unreached.pop(unreached, None)
 
@@ -175,17 +187,14 @@ class Responder:
             return explain(self._node, self._handle, error)
         return Undeliverable(str(error))
 
-    def _after_slow_send(self, header: RequestHeader) -> None:
-        """Raise if the middleware dropped the response after it had waited."""
-        warned = bool(__warningregistry__)
-        __warningregistry__.clear()
+    def _check_visible(self, header: RequestHeader) -> None:
+        """Raise if the graph does not show the client: the middleware dropped the response."""
         guid = client_of(header)
-        if warned or (guid is not None and self._is_invisible(guid)):
-            self._fail(header, "the client was not matched in time")
-
-    def _is_invisible(self, guid: bytes) -> bool:
+        if guid is None:
+            return
         self._graph.refresh(monotonic())
-        return guid not in self._graph.readers and not self._graph.empty
+        if guid not in self._graph.readers and not self._graph.empty:
+            self._fail(header, NOT_MATCHED)
 
     def _fail(self, header: RequestHeader, reason: str) -> NoReturn:
         """Remember the client and raise the error that says whether to send again."""
