@@ -56,6 +56,9 @@ class _Abandoned(NamedTuple):
 class ClientOwner(Protocol):
     """What a client needs to know of its service, and reports to it."""
 
+    def is_matched(self, client: Client) -> bool:
+        """Return whether a client is matched, and reset its servers if the graph has changed."""
+
     def on_capacity(self) -> None:
         """React to places in the window that may have become free."""
 
@@ -369,7 +372,8 @@ class Client:
 
     def _has_server(self, attempts: Attempts) -> bool:
         try:
-            return self.ready()
+            # `ready` as well: a server may vanish before the graph changes.
+            return self.ready() and self._owner.is_matched(self)
         except Exception as error:
             if not attempts.call.future.done():
                 attempts.call.future.set_exception(error)

@@ -214,7 +214,10 @@ class ClientSet:
             self._watch.advance()
         else:
             servers = self._node.find_servers(self._service)
+            self._servers_generation = self._watch.generation
         for client in self:
+            # At once: requests are sent again here, and others may replace these servers soon.
+            client.servers = servers or None
             client.fail_lost(servers, error)
 
     def grow(self, callers: int) -> None:

@@ -301,6 +301,10 @@ class ServicePool:
 
     # For the clients.
 
+    def is_matched(self, client: Client) -> bool:
+        """Return whether a client is matched, and reset its servers if the graph has changed."""
+        return self._clients.is_matched(client)
+
     def on_matched(self) -> None:
         """Report to the traced calls that a client is matched: from now on they are queued."""
         self._traces.on_matched()

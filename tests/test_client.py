@@ -37,6 +37,9 @@ class ClientUnderTest:
         self.node.clients.append(self.port)
         return self.port
 
+    def is_matched(self, client: Client) -> bool:
+        return client is self.client
+
     def on_capacity(self) -> None:
         self.capacity += 1
 

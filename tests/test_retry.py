@@ -23,6 +23,7 @@ from rosasync import (
 )
 from rosasync.client import Counts
 from rosasync.retry import Attempts, RetryBudget
+from rosasync.service_pool import GONE_DELAY
 from rosasync.testing import FakeNode
 from tests.support.echo import ECHO, answer_to, request_of
 from tests.support.plain import Echo, echo
@@ -400,6 +401,22 @@ class TestNextServer:
             assert (await asyncio.wait_for(task, LIMIT)).value == 1
             assert received(server) == [1]
 
+    async def test_once_however_often_the_graph_changes_then(self, fake_graph: FakeGraph) -> None:
+        server = fake_graph.serve(Echo, "/echo", echo)
+        async with fake_graph.session() as session:
+            await ask(session, 0)
+            with fake_graph.hold_requests():
+                task = start(session, 1, retry=FAST_ONLY, timeout=None)
+                await asyncio.sleep(0)
+                server.close()
+                fake_graph.serve(Echo, "/echo", echo)
+                await until(lambda: session.pool.statistics().retried)
+                for _ in range(3):
+                    fake_graph.changed()
+                    await asyncio.sleep(4 * GONE_DELAY)
+                assert session.pool.statistics().retried == 1
+            assert (await asyncio.wait_for(task, LIMIT)).value == 1
+
     async def test_whatever_the_budget(self, fake_graph: FakeGraph) -> None:
         server = fake_graph.serve(Echo, "/echo", echo)
         async with fake_graph.session() as session:
@@ -502,3 +519,25 @@ class TestNextServer:
                 await successor.serve("/restarted")
                 answers = await asyncio.gather(*tasks)
         assert [answer_to(answer) for answer in answers] == list("01234")
+
+    async def test_a_stock_successor_gets_it_once(
+        self, bridge: Bridge, server: ServerProcess
+    ) -> None:
+        await server.serve("/restarted", delay="hold")
+        async with (
+            ServerProcess("successor") as successor,
+            Session("caller", bridge=bridge, timeout=4 * LIMIT) as session,
+        ):
+            await session.wait_for_service(ECHO, "/restarted", timeout=LIMIT)
+            task = session.start(ECHO, "/restarted", request_of("0"), retry=FAST_ONLY)
+            await server.received("/restarted", 1)
+            await server.stop("/restarted")
+            await successor.serve("/restarted", delay="hold")
+            await successor.received("/restarted", 1)
+            for other in ("/some", "/other"):
+                await server.serve(other)
+                await session.wait_for_service(ECHO, other, timeout=LIMIT)
+                await asyncio.sleep(4 * GONE_DELAY)
+            assert await successor.received("/restarted") == ["0"]
+            await successor.release("/restarted")
+            assert answer_to(await task) == "0"
