@@ -351,7 +351,7 @@ class FakeNode:
 
     def find_servers(self, service: Service) -> frozenset[Hashable]:
         """Identify the servers of this name and type."""
-        return frozenset(map(id, self.graph.find(service.key.srv_type, service.key.srv_name)))
+        return frozenset(self.graph.find(service.key.srv_type, service.key.srv_name))
 
     def explain_missing(self, service: Service) -> str:
         """List the services in the graph, with their types."""
