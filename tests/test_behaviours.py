@@ -261,7 +261,7 @@ class TestWaitForService:
         assert leaf.feedback_message == "aborted"
 
     async def test_each_run_looks_anew(self, graph: FakeGraph, fake_session: Session) -> None:
-        leaf = ready(WaitForService("wait", ECHO, NAME, timeout=TICK), fake_session)
+        leaf = ready(WaitForService("wait", ECHO, NAME, timeout=20 * TICK), fake_session)
         assert await ticked(leaf) is Status.SUCCESS
         graph.servers[0].close()
         assert await ticked(leaf) is Status.FAILURE
@@ -338,7 +338,7 @@ class TestBlackboard:
             *("leaf", ECHO, NAME, request_of("a")),
             key_response="response",
             key_error="error",
-            timeout=TICK,
+            timeout=20 * TICK,
         )
         assert await ticked(ready(leaf, fake_session)) is Status.SUCCESS
         with graph.drop_requests():

@@ -38,6 +38,9 @@ Misbehaviour = Literal["twice", "thrice", "forging", "every second"] | None
 """What a server does wrong: it answers each request twice or thrice, or only every second one, or
 it precedes each answer by others under the numbers of earlier requests and of none."""
 
+REPLACED_AFTER = LIMIT / 2
+"""Seconds after which a process that hangs in the middleware is replaced, between two tests."""
+
 
 @contextmanager
 def running(program: Path, *arguments: str) -> Iterator[None]:
@@ -99,7 +102,8 @@ class ServerProcess(Child):
             "wrong": wrong,
         }
         try:
-            self.ask_now("serve", patience=4 * LIMIT if self._serving else LIMIT / 2, **arguments)
+            patience = 4 * LIMIT if self._serving else REPLACED_AFTER
+            self.ask_now("serve", patience=patience, **arguments)
         except Unanswered:
             if self._serving:
                 raise
@@ -129,13 +133,9 @@ class ServerProcess(Child):
         result: int = await self.ask("answered", name=name, at_least=at_least)
         return result
 
-    async def clear(self) -> None:
-        """Destroy all services and forget what they counted."""
-        await asyncio.to_thread(self.clear_now)
-
     def clear_now(self) -> None:
-        """As `clear`; blocks."""
-        self.ask_now("clear")
+        """Destroy all services and forget what they counted; blocks."""
+        self.ask_now("clear", patience=REPLACED_AFTER)
         self._serving = False
 
 
