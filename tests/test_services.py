@@ -56,6 +56,7 @@ class Middleware:
         now: what ``monotonic`` returns.
         unmatched: the clients to which a send waits and fails.
         report: how a failure is reported: "error", "warning" or "nothing".
+        wait: the seconds for which a send waits before it fails.
         sent: the clients that were sent to, in order.
         queries: how often the graph was queried.
     """
@@ -68,6 +69,7 @@ class Middleware:
         self.now = 100.0
         self.unmatched: set[bytes] = set()
         self.report = "error"
+        self.wait = BLOCKED
         self.sent: list[bytes] = []
         self.queries = 0
         self.readers: dict[bytes, QoSProfile] = {}
@@ -98,7 +100,7 @@ class Middleware:
         self.sent.append(client)
         if client not in self.unmatched:
             return
-        self.now += BLOCKED
+        self.now += self.wait
         if self.report == "error":
             raise SystemError from RuntimeWarning("client will not receive response")
         if self.report == "warning":
@@ -251,12 +253,12 @@ def test_a_slow_send_to_a_visible_client_has_sent(
 
 
 def test_a_send_that_fails_without_waiting_has_failed(
-    middleware: Middleware, service: Responder, monkeypatch: pytest.MonkeyPatch
+    middleware: Middleware, service: Responder
 ) -> None:
     """A profile may set the time for which the middleware waits."""
     middleware.report = "warning"
     middleware.unmatched.add(GOOD)
-    monkeypatch.setattr("tests.test_services.BLOCKED", 0.0)
+    middleware.wait = 0.0
     assert "not matched" in fail(service, GOOD)
 
 

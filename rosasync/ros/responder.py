@@ -39,6 +39,8 @@ MATCH_DELAYS = (0.05, 0.2, 0.8, 3.2)
 between further sends. On a machine with other work a match may take longer than a send waits."""
 MOST_UNREACHED = 1000
 """Maximum number of clients that are remembered as unreached."""
+NOT_MATCHED = "the client was not matched in time"
+"""The reason of a failed send for which rclpy gives none."""
 
 INFO = struct.Struct("<qq16sq")
 """``rmw_service_info_t``: two timestamps, and a request id of a GUID and a sequence number."""
@@ -50,7 +52,6 @@ __warningregistry__: dict[Any, Any] = {}
 # Held from a send until the registry was looked at, because all threads share it. Reentrant,
 # because the garbage collector may run a __del__ that sends.
 _sends = threading.RLock()
-NOT_MATCHED = "the client was not matched in time"
 
 
 @dataclass(slots=True)

@@ -101,12 +101,12 @@ class ServerProcess(Child):
             "copies": copies,
             "wrong": wrong,
         }
+        if self._serving:
+            self.ask_now("serve", **arguments)
+            return
         try:
-            patience = 4 * LIMIT if self._serving else REPLACED_AFTER
-            self.ask_now("serve", patience=patience, **arguments)
+            self.ask_now("serve", patience=REPLACED_AFTER, **arguments)
         except Unanswered:
-            if self._serving:
-                raise
             self.restart()
             self.ask_now("serve", **arguments)
         self._serving = True
