@@ -18,7 +18,7 @@ from benchmarks.results import Results
 from benchmarks.runner import Runner
 from benchmarks.suites import SUITES, make_suite
 from benchmarks.tables import make_console, scenario_table, target_table
-from rosasync.ros.domain import isolate
+from rosasync._ros.domain import isolate
 
 ROUNDS, QUICK_ROUNDS, ALLOCATION_ROUNDS = 9, 5, 3
 PINNED_CORES = 4

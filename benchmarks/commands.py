@@ -18,7 +18,7 @@ from benchmarks.hosts import NoHosts
 from benchmarks.pages import replace_section
 from benchmarks.tables import make_console, make_table
 from benchmarks.trials import Goal, Trials
-from rosasync.ros.domain import isolate
+from rosasync._ros.domain import isolate
 
 __all__ = ["add_commands", "save"]
 

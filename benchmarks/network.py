@@ -17,7 +17,7 @@ from benchmarks.lossy import LossyHosts
 from benchmarks.machine import describe_machine
 from benchmarks.pipes import Child, ChildError
 from benchmarks.work import READY_TIMEOUT, Work
-from rosasync.profile import SWITCH, is_old, profile_text, profile_variable
+from rosasync._ros.profile import SWITCH, is_old, profile_text, profile_variable
 
 __all__ = ["Cell", "NetworkResults", "chosen", "every", "measure_network", "write_network"]
 

@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+from rosasync._client.pool import ClientPool, LeasedClient
+from rosasync._core.futures import wrap_future
+from rosasync._core.portal import Portal
+from rosasync._core.proxy import AsyncServiceProxy, ProxyState
+from rosasync._ros.messages import to_dict, to_message
+from rosasync._server.server import RequestInfo, ServiceCall, ServiceServer
 from rosasync.errors import (
     CallError,
     ContextShutdown,
@@ -15,13 +21,7 @@ from rosasync.errors import (
     SessionClosed,
     UsageError,
 )
-from rosasync.futures import wrap_future
 from rosasync.options import Limits, Retry
-from rosasync.pool import ClientPool, LeasedClient
-from rosasync.portal import Portal
-from rosasync.proxy import AsyncServiceProxy, ProxyState
-from rosasync.ros.messages import to_dict, to_message
-from rosasync.server import RequestInfo, ServiceCall, ServiceServer
 from rosasync.session import ServiceClient, Session
 from rosasync.statistics import (
     KeyStatistics,

@@ -17,7 +17,7 @@ def main() -> None:
                 file=sys.stderr,
             )
             sys.exit(2)
-        from rosasync.cli.app import main as run
+        from rosasync._cli.app import main as run
 
         code = run()
     except KeyboardInterrupt:

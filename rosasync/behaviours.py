@@ -17,9 +17,9 @@ import contextlib
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Generic
 
+from rosasync._core.proxy import AsyncServiceProxy, ProxyState
 from rosasync.errors import UsageError
 from rosasync.options import check_timeout
-from rosasync.proxy import AsyncServiceProxy, ProxyState
 from rosasync.typing import RequestT, ResponseT, ServiceType, Timeout
 
 try:

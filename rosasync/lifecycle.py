@@ -16,7 +16,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from rosasync import CallError, ResponseTimeout, RosasyncError
-from rosasync.node_client import NodeClient
+from rosasync._core.node_client import NodeClient
 
 if TYPE_CHECKING:
     from rosasync import Session

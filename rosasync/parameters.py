@@ -38,7 +38,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, overload
 import anyio
 
 from rosasync import RosasyncError, to_dict
-from rosasync.node_client import NodeClient
+from rosasync._core.node_client import NodeClient
 
 if TYPE_CHECKING:
     from rosasync import Session

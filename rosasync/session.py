@@ -8,11 +8,11 @@ from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Generic, Literal, NoReturn, Self, overload
 
-from rosasync.aio import call_in_thread, start_task
-from rosasync.core import Core, session_closed
+from rosasync._core.aio import call_in_thread, start_task
+from rosasync._core.core import Core, session_closed
+from rosasync._ros.middleware import check_middleware
 from rosasync.errors import UsageError
 from rosasync.options import Limits, Retry, SessionOptions, check_timeout
-from rosasync.ros.middleware import check_middleware
 from rosasync.statistics import SessionStatistics
 from rosasync.typing import RequestT, ResponseT, ServiceType, Timeout
 
@@ -22,14 +22,14 @@ if TYPE_CHECKING:
     from rclpy.node import Node
     from rclpy.qos import QoSProfile
 
-    from rosasync.gateway import LoopGateway
-    from rosasync.handlers import ErrorHook, Handler, OverloadHook
-    from rosasync.pool import ClientPool
-    from rosasync.portal import Portal
-    from rosasync.ports import NodePort
-    from rosasync.ros.node import RosNode
-    from rosasync.server import ServiceServer
-    from rosasync.service_pool import ServicePool
+    from rosasync._client.pool import ClientPool
+    from rosasync._client.service_pool import ServicePool
+    from rosasync._core.gateway import LoopGateway
+    from rosasync._core.portal import Portal
+    from rosasync._core.ports import NodePort
+    from rosasync._ros.node import RosNode
+    from rosasync._server.handlers import ErrorHook, Handler, OverloadHook
+    from rosasync._server.server import ServiceServer
     from rosasync.tracing import Trace
 
 __all__ = ["ServiceClient", "Session"]
@@ -519,7 +519,7 @@ class Session:
         self, gateway: LoopGateway, on_graph: Callable[[], None], on_shutdown: Callable[[], None]
     ) -> NodePort:
         """Open the node. The session of `rosasync.testing` overrides this."""
-        ros_node: type[RosNode] = _import_ros("rosasync.ros.node").RosNode
+        ros_node: type[RosNode] = _import_ros("rosasync._ros.node").RosNode
         return ros_node(self._options, gateway, on_graph, on_shutdown)
 
     def _use(self) -> Core:
@@ -608,8 +608,8 @@ def _not_open() -> UsageError:
 
 def _load_ros() -> None:
     """Import rclpy and what it loads for the first node; raises as `_import_ros`."""
-    _import_ros("rosasync.ros.node")
-    _import_ros("rosasync.ros.type_supports").load()
+    _import_ros("rosasync._ros.node")
+    _import_ros("rosasync._ros.type_supports").load()
 
 
 def _import_ros(module: str) -> Any:

@@ -18,8 +18,8 @@ import pytest
 import uvloop
 
 from rosasync import Session
-from rosasync.ros.domain import isolate
-from rosasync.ros.shared_memory import unfinished_ports
+from rosasync._ros.domain import isolate
+from rosasync._ros.shared_memory import unfinished_ports
 from tests.faults.table import pytest_terminal_summary
 from tests.support.clients import ClientProcess
 from tests.support.process import Unanswered

@@ -8,7 +8,7 @@ from functools import partial
 
 import pytest
 
-from rosasync.aio import SPARE, Deadlines, Expired
+from rosasync._core.aio import SPARE, Deadlines, Expired
 from tests.support.times import LIMIT, TICK
 
 

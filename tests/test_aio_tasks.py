@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from rosasync.aio import start_task
+from rosasync._core.aio import start_task
 
 pytestmark = pytest.mark.asyncio(loop_factories=["asyncio", "uvloop"])
 

@@ -15,8 +15,8 @@ from importlib.metadata import PackageNotFoundError, version
 import psutil
 import pytest
 
-from rosasync.demo.run import Report, Samples
-from rosasync.demo.stock import READY
+from rosasync._demo.run import Report, Samples
+from rosasync._demo.stock import READY
 from tests.support.process import ended
 from tests.support.program import as_root, own_shared_memory
 
@@ -132,7 +132,7 @@ def test_ctrl_c_ends_a_command_whose_loop_sleeps() -> None:
     """The signal comes on another thread, so it does not interrupt the sleep by itself."""
     code = (
         "import asyncio, signal, threading, time\n"
-        "from rosasync.cli.run import run\n"
+        "from rosasync._cli.run import run\n"
         "def strike():\n"
         "    time.sleep(0.2)\n"
         "    signal.pthread_kill(threading.get_ident(), signal.SIGINT)\n"
@@ -169,7 +169,7 @@ def test_ctrl_c_ends_the_demo_and_its_server() -> None:
 
 
 def test_stock_server_ends_with_its_standard_input() -> None:
-    command = (sys.executable, "-m", "rosasync.demo.stock", "/rosasync_test/echo")
+    command = (sys.executable, "-m", "rosasync._demo.stock", "/rosasync_test/echo")
     with ended(subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)) as server:
         assert server.stdin is not None
         assert server.stdout is not None

@@ -14,7 +14,7 @@ from rcl_interfaces.msg import ParameterValue
 from std_srvs.srv import SetBool
 
 from rosasync import to_dict, to_message
-from rosasync.cli.documents import (
+from rosasync._cli.documents import (
     DocumentError,
     documents,
     dump_json,
@@ -22,9 +22,9 @@ from rosasync.cli.documents import (
     plain,
     read_message,
 )
-from rosasync.cli.requests import template
-from rosasync.ros.interfaces import installed_types, parts
-from rosasync.ros.messages import FieldType, field_types
+from rosasync._cli.requests import template
+from rosasync._ros.interfaces import installed_types, parts
+from rosasync._ros.messages import FieldType, field_types
 
 PACKAGES = {
     "diagnostic_msgs",

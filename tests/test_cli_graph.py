@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from rosasync.ros.middleware import installed_middlewares
+from rosasync._ros.middleware import installed_middlewares
 from tests.support.command import LAMP, LAMP_TYPE, json_lines, rosasync, terminal
 
 PROFILE, OTHER_PROFILE = "FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"

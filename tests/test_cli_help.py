@@ -34,7 +34,7 @@ def examples_of(command: str) -> list[str]:
 def test_help_lists_every_command_without_rclpy() -> None:
     code = (
         "import sys; sys.argv[1:] = ['--help']; sys.modules['rclpy'] = None\n"
-        "from rosasync.cli.app import main\n"
+        "from rosasync._cli.app import main\n"
         "assert main() == 0\n"
         "assert not [name for name in sys.modules if name.startswith('rclpy.')]\n"
         "assert not [name for name in sys.modules if name.startswith('rich')]\n"
@@ -55,7 +55,7 @@ def test_without_arguments_it_prints_the_help() -> None:
 def test_bad_usage_is_one_line_and_imports_no_rclpy(arguments: tuple[str, ...]) -> None:
     code = (
         f"import sys; sys.argv[1:] = {arguments!r}; sys.modules['rclpy'] = None\n"
-        "from rosasync.cli.app import main\n"
+        "from rosasync._cli.app import main\n"
         "assert main() == 2\n"
     )
     done = subprocess.run(

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 import yaml
 
-from rosasync.cli.param import read_value
+from rosasync._cli.param import read_value
 from rosasync.parameters import ParameterType
 from tests.support.command import rosasync
 from tests.support.managed import NodesProcess

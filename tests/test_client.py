@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 
 from rosasync import Limits, Retry
-from rosasync.aio import Deadlines, Expired
-from rosasync.call import Call
-from rosasync.client import Client, Counts
-from rosasync.retry import Attempts, RetryBudget
+from rosasync._client.call import Call
+from rosasync._client.client import Client, Counts
+from rosasync._client.retry import Attempts, RetryBudget
+from rosasync._core.aio import Deadlines, Expired
 from rosasync.statistics import ServiceKey
 from rosasync.testing import FakeClient, FakeGraph, FakeNode
 from tests.support.nodes import reports

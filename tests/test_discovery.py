@@ -11,8 +11,7 @@ from collections.abc import Iterator
 import pytest
 
 import rosasync
-from rosasync import profile
-from rosasync.ros import discovery
+from rosasync._ros import discovery, profile
 from tests.support.servers import ServerProcess
 from tests.support.times import LIMIT
 

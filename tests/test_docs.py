@@ -25,7 +25,7 @@ from sybil import Example, Sybil
 from sybil.parsers.markdown import CodeBlockParser
 
 import rosasync
-from rosasync.ros.domain import isolate
+from rosasync._ros.domain import isolate
 from tests.support.process import ROOT, ended, first_line, own, profile
 from tests.support.project import python_path
 from tests.support.servers import running

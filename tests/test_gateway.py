@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from rosasync import SessionClosed
-from rosasync.gateway import LoopGateway
+from rosasync._core.gateway import LoopGateway
 from rosasync.testing import FakeGraph
 from tests.support.times import LIMIT, until
 

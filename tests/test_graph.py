@@ -12,7 +12,7 @@ import pytest
 from rclpy.qos import QoSProfile, QoSReliabilityPolicy
 
 from rosasync import AsyncServiceProxy, Limits, ProxyState, ServiceUnavailable, Session
-from rosasync.mismatch import MISMATCH_DELAY
+from rosasync._client.mismatch import MISMATCH_DELAY
 from rosasync.testing import FakeGraph, VirtualClock
 from tests.support.checks import assert_clean, check_call
 from tests.support.echo import ECHO, answer_to, request_of

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosasync import LatencyStatistics, ResponseTimeout, Session
-from rosasync.latency import LatencyHistogram, summarize
+from rosasync._client.latency import LatencyHistogram, summarize
 from tests.support.echo import ECHO
 from tests.support.serving import ask
 from tests.support.times import TICK

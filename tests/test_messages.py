@@ -31,7 +31,7 @@ from sensor_msgs.srv import SetCameraInfo
 from std_msgs.msg import Bool, ByteMultiArray, Int8, Int64, String, UInt8MultiArray, UInt64
 from std_srvs.srv import Empty, SetBool, Trigger
 
-from rosasync.ros.messages import (
+from rosasync._ros.messages import (
     request_message,
     service_type,
     to_dict,
@@ -709,7 +709,7 @@ def test_plain_values_survive_the_round_trip(message_type: type[Any], data: st.D
 
 def test_importing_it_imports_nothing_of_ros() -> None:
     code = (
-        "import sys, rosasync.ros.messages;"
+        "import sys, rosasync._ros.messages;"
         "print([name for name in sys.modules if name.startswith(('rclpy', 'rosidl', 'numpy'))])"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -8,8 +8,8 @@ import sys
 
 import pytest
 
-from rosasync.ros.interfaces import constants, fields, installed_types, parts
-from rosasync.ros.middleware import installed_middlewares
+from rosasync._ros.interfaces import constants, fields, installed_types, parts
+from rosasync._ros.middleware import installed_middlewares
 from tests.support.command import rosasync
 from tests.support.process import ROOT
 

@@ -16,9 +16,9 @@ import anyio
 import pytest
 
 from rosasync import Session, SessionClosed, UsageError
-from rosasync.aio import call_in_thread
-from rosasync.ros import node as ros_node
-from rosasync.ros import type_supports
+from rosasync._core.aio import call_in_thread
+from rosasync._ros import node as ros_node
+from rosasync._ros import type_supports
 from tests.support.process import ROOT
 from tests.support.times import LIMIT, TICK, until
 
@@ -150,7 +150,7 @@ async def test_an_import_error_is_raised(gate: Gate, nodes: list[Any]) -> None:
 
 
 async def test_without_rclpy_the_error_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "rosasync.ros.type_supports", None)
+    monkeypatch.setitem(sys.modules, "rosasync._ros.type_supports", None)
     with pytest.raises(ImportError, match=r"pip install 'rosasync\[jazzy\]'"):
         await Session("slow").__aenter__()
 

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from rosasync import Limits, QueueTimeout, ResponseTimeout, Session, response_times
-from rosasync.client import Client
-from rosasync.response_times import ResponseTimes
+from rosasync import Limits, QueueTimeout, ResponseTimeout, Session
+from rosasync._client import response_times
+from rosasync._client.client import Client
+from rosasync._client.response_times import ResponseTimes
 from tests.support.plain import Echo, echo
 from tests.support.times import LIMIT, TICK, until
 

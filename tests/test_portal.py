@@ -110,7 +110,7 @@ class TestCall:
     async def test_the_deadline_holds_where_the_loop_is_stuck(
         self, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("rosasync.portal.MARGIN", TICK)
+        monkeypatch.setattr("rosasync._core.portal.MARGIN", TICK)
         graph = FakeGraph()
         graph.serve(ECHO, NAME, lambda _: None)
         async with graph.session() as session:

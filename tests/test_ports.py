@@ -9,10 +9,10 @@ from typing import Any, Literal
 import pytest
 
 from rosasync import InvalidServiceName
-from rosasync.gateway import LoopGateway
+from rosasync._core.gateway import LoopGateway
+from rosasync._core.ports import ClientPort, NodePort
+from rosasync._ros.node import RosNode
 from rosasync.options import Limits, SessionOptions
-from rosasync.ports import ClientPort, NodePort
-from rosasync.ros.node import RosNode
 from rosasync.testing import FakeGraph, FakeNode
 from tests.support.echo import ECHO, answer_to, fill, request_of, service_class
 from tests.support.servers import ServerProcess

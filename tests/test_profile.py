@@ -16,7 +16,7 @@ import pytest
 
 from benchmarks.hosts import NoHosts
 from benchmarks.lossy import LossyHosts
-from rosasync import profile
+from rosasync._ros import profile
 from tests.support.process import first_line, own
 from tests.support.program import as_root, own_shared_memory
 from tests.support.times import LIMIT, TICK, until
@@ -190,7 +190,7 @@ def test_nothing_stays(monkeypatch: pytest.MonkeyPatch) -> None:
 OPEN = """
 import asyncio, logging, sys
 import rclpy, rosasync
-from rosasync import profile
+from rosasync._ros import profile
 
 async def main():
     if "late" in sys.argv:

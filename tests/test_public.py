@@ -124,8 +124,8 @@ def test_only_ros_imports_rclpy() -> None:
     offenders = [
         f"{file.relative_to(PACKAGE)}:{node.lineno}"
         for file in PACKAGE.rglob("*.py")
-        if "ros" not in file.relative_to(PACKAGE).parts
-        and file.relative_to(PACKAGE) != Path("demo/stock.py")
+        if "_ros" not in file.relative_to(PACKAGE).parts
+        and file.relative_to(PACKAGE) != Path("_demo/stock.py")
         for node in _runtime_imports(ast.parse(file.read_text()))
         if any(name.partition(".")[0] == "rclpy" for name in _imported(node))
     ]

@@ -18,12 +18,11 @@ from rosasync import (
     ServerGone,
     Session,
     SessionClosed,
-    response_times,
-    retry,
 )
-from rosasync.client import Counts
-from rosasync.retry import Attempts, RetryBudget
-from rosasync.service_pool import GONE_DELAY
+from rosasync._client import response_times, retry
+from rosasync._client.client import Counts
+from rosasync._client.retry import Attempts, RetryBudget
+from rosasync._client.service_pool import GONE_DELAY
 from rosasync.testing import FakeNode
 from tests.support.echo import ECHO, answer_to, request_of
 from tests.support.plain import Echo, echo

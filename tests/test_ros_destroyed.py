@@ -18,10 +18,10 @@ from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import SetBool
 
 from rosasync import Session
+from rosasync._core.ports import PortDestroyed
+from rosasync._ros import signals
+from rosasync._ros.rcl import Rcl
 from rosasync.errors import ContextShutdown, InvalidServiceName, RosasyncError, UsageError
-from rosasync.ports import PortDestroyed
-from rosasync.ros import signals
-from rosasync.ros.rcl import Rcl
 from tests.conftest import Bridge
 from tests.support.checks import count_descriptors, count_threads
 from tests.support.echo import ECHO, request_of

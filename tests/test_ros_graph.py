@@ -13,10 +13,10 @@ from rclpy.duration import Duration
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from std_srvs.srv import SetBool, Trigger
 
+from rosasync._ros import endpoints, graph, node
+from rosasync._ros.endpoints import gid_of, incompatibility, response_writers
+from rosasync._ros.graph import GraphQueries, GraphWaitable
 from rosasync.errors import UsageError
-from rosasync.ros import endpoints, graph, node
-from rosasync.ros.endpoints import gid_of, incompatibility, response_writers
-from rosasync.ros.graph import GraphQueries, GraphWaitable
 from tests.conftest import Bridge
 from tests.support.echo import ECHO
 from tests.support.nodes import Opened, borrowed_node, open_node

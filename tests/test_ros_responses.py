@@ -13,9 +13,9 @@ from typing import Any
 import pytest
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 
-from rosasync.ports import Undeliverable, Unmatched
-from rosasync.ros.endpoints import gid_of, response_readers
-from rosasync.ros.responder import client_of
+from rosasync._core.ports import Undeliverable, Unmatched
+from rosasync._ros.endpoints import gid_of, response_readers
+from rosasync._ros.responder import client_of
 from tests.conftest import Bridge
 from tests.support.echo import ECHO, request_of, service_class
 from tests.support.nodes import Opened, borrowed_node, open_node, reports

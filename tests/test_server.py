@@ -19,7 +19,7 @@ from rosasync import (
     SessionClosed,
     UsageError,
 )
-from rosasync.ros.services import take_requests
+from rosasync._ros.services import take_requests
 from tests.support.echo import ECHO, answer_to
 from tests.support.serving import (
     AnyCall,

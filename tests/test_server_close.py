@@ -21,7 +21,7 @@ from rosasync import (
     SessionClosed,
     UsageError,
 )
-from rosasync.ports import PortDestroyed
+from rosasync._core.ports import PortDestroyed
 from tests.support.echo import ECHO
 from tests.support.serving import (
     AnyCall,
@@ -125,7 +125,7 @@ class TestClose:
     async def test_a_handler_that_ignores_its_cancellation(
         self, session: Session, caplog: pytest.LogCaptureFixture, monkeypatch: Any
     ) -> None:
-        monkeypatch.setattr("rosasync.server.CANCEL_TIMEOUT", TICK)
+        monkeypatch.setattr("rosasync._server.server.CANCEL_TIMEOUT", TICK)
         gate = asyncio.Event()
         ended: list[object] = []
 
@@ -277,7 +277,7 @@ class TestLastResponses:
     async def test_the_end_waits_until_they_are_received(
         self, session: Session, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("rosasync.service_call.DELIVERY_TIME", LIMIT)
+        monkeypatch.setattr("rosasync._server.service_call.DELIVERY_TIME", LIMIT)
         server = session.serve(ECHO, "/served", echo_call)
         received = asyncio.Event()
         monkeypatch.setattr(server._port, "delivered", received.is_set)
@@ -291,7 +291,7 @@ class TestLastResponses:
     async def test_the_deadline_ends_the_wait(
         self, session: Session, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("rosasync.service_call.DELIVERY_TIME", 10 * LIMIT)
+        monkeypatch.setattr("rosasync._server.service_call.DELIVERY_TIME", 10 * LIMIT)
         server = session.serve(ECHO, "/served", echo_call)
         monkeypatch.setattr(server._port, "delivered", lambda: False)
         assert await ask(session, "/served", "text") == "text"
@@ -300,7 +300,7 @@ class TestLastResponses:
     async def test_no_wait_for_old_ones(
         self, session: Session, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("rosasync.service_call.DELIVERY_TIME", TICK)
+        monkeypatch.setattr("rosasync._server.service_call.DELIVERY_TIME", TICK)
         server = session.serve(ECHO, "/served", echo_call)
         monkeypatch.setattr(server._port, "delivered", lambda: pytest.fail("asked"))
         assert await ask(session, "/served", "text") == "text"
@@ -310,7 +310,7 @@ class TestLastResponses:
     async def test_no_wait_if_no_client_is_left(
         self, session: Session, bridge: Bridge, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("rosasync.service_call.DELIVERY_TIME", 10 * LIMIT)
+        monkeypatch.setattr("rosasync._server.service_call.DELIVERY_TIME", 10 * LIMIT)
         server = session.serve(ECHO, "/served", echo_call)
         monkeypatch.setattr(server._port, "delivered", lambda: False)
         async with Session("leaving", bridge=bridge) as client:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from rosasync import ContextShutdown, Limits, ServerGone, Session, SessionClosed
-from rosasync.ports import PortDestroyed
+from rosasync._core.ports import PortDestroyed
 from tests.support.echo import ECHO
 from tests.support.serving import (
     AnyCall,

@@ -20,8 +20,8 @@ from rosasync import (
     Session,
     SessionClosed,
 )
-from rosasync.graph_watch import POLL_MAX
-from rosasync.ports import PortDestroyed
+from rosasync._client.graph_watch import POLL_MAX
+from rosasync._core.ports import PortDestroyed
 from rosasync.testing import FakeClient, FakeGraph
 from tests.support.plain import Echo, echo
 from tests.support.times import LIMIT, TICK, until

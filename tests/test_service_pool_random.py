@@ -11,9 +11,10 @@ from typing import Any
 
 import pytest
 
-from rosasync import Limits, Retry, RosasyncError, Session, response_times
-from rosasync.ports import PortDestroyed
-from rosasync.service_pool import ServicePool
+from rosasync import Limits, Retry, RosasyncError, Session
+from rosasync._client import response_times
+from rosasync._client.service_pool import ServicePool
+from rosasync._core.ports import PortDestroyed
 from rosasync.testing import FakeClient, FakeGraph, FakeServer
 from tests.support.times import TICK, until
 

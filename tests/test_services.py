@@ -10,10 +10,9 @@ import pytest
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 
-from rosasync.errors import ContextShutdown
-from rosasync.ports import PortDestroyed, Undeliverable, Unmatched
-from rosasync.ros import responder
-from rosasync.ros.responder import (
+from rosasync._core.ports import PortDestroyed, Undeliverable, Unmatched
+from rosasync._ros import responder
+from rosasync._ros.responder import (
     MATCH_DELAYS,
     MOST_UNREACHED,
     POLL_INTERVAL,
@@ -21,7 +20,8 @@ from rosasync.ros.responder import (
     Responder,
     client_of,
 )
-from rosasync.service_call import RESEND
+from rosasync._server.service_call import RESEND
+from rosasync.errors import ContextShutdown
 from tests.support.times import LIMIT, TICK
 
 BLOCKED = 0.1

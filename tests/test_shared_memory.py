@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from rosasync import RosasyncError
-from rosasync.profile import is_old, profile_variable
-from rosasync.ros import shared_memory
-from rosasync.ros.shared_memory import check_ports, unfinished_ports
+from rosasync._ros import shared_memory
+from rosasync._ros.profile import is_old, profile_variable
+from rosasync._ros.shared_memory import check_ports, unfinished_ports
 from tests.support.times import TICK
 
 PREFIX = "fastrtps_port" if is_old() else "fastdds_port"

@@ -12,7 +12,7 @@ from diagnostic_msgs.srv import AddDiagnostics
 from nav_msgs.msg import OccupancyGrid
 from std_srvs.srv import Empty
 
-from rosasync.sizes import payload_size
+from rosasync._server.sizes import payload_size
 
 
 @pytest.mark.parametrize(

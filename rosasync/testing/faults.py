@@ -9,10 +9,10 @@ from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from rosasync.ports import PortDestroyed, Undeliverable, Unmatched
+from rosasync._core.ports import PortDestroyed, Undeliverable, Unmatched
 
 if TYPE_CHECKING:
-    from rosasync.ports import DeliverRequest, RequestHeader, Service, ServicePort
+    from rosasync._core.ports import DeliverRequest, RequestHeader, Service, ServicePort
     from rosasync.testing.hooks import OpenService
 
 __all__ = ["Faults", "FaultyService", "StubCall", "set_in_block"]
@@ -76,7 +76,7 @@ def set_in_block(owner: object, name: str, value: object) -> Iterator[None]:
 
 
 class FaultyService:
-    """A service port with faults: a `rosasync.ports.ServicePort`.
+    """A service port with faults: a `rosasync._core.ports.ServicePort`.
 
     Args:
         open_service: opens the port that this one wraps.

@@ -24,10 +24,10 @@ from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import Any
 
+from rosasync._core.gateway import LoopGateway
+from rosasync._core.ports import Deliver, DeliverRequest, Service, Undeliverable
+from rosasync._ros.messages import request_message, service_type, type_name
 from rosasync.errors import InvalidServiceName
-from rosasync.gateway import LoopGateway
-from rosasync.ports import Deliver, DeliverRequest, Service, Undeliverable
-from rosasync.ros.messages import request_message, service_type, type_name
 from rosasync.session import Session
 from rosasync.statistics import ServiceKey
 from rosasync.testing.faults import set_in_block
@@ -101,7 +101,7 @@ class FakeServer:
 
 @dataclass(frozen=True)
 class FakeHeader:
-    """The header of a request in memory: a `rosasync.ports.RequestHeader`, and its own id."""
+    """The header of a request in memory: a `rosasync._core.ports.RequestHeader`, and its own id."""
 
     client: FakeClient
     sequence_number: int
@@ -115,7 +115,7 @@ class FakeHeader:
 
 
 class FakeService(FakeServer):
-    """A service that a session serves in a `FakeGraph`: a `rosasync.ports.ServicePort`.
+    """A service that a session serves in a `FakeGraph`: a `rosasync._core.ports.ServicePort`.
 
     Attributes:
         sent: copies of the responses sent, in order.
@@ -270,7 +270,7 @@ class FakeSession(Session):
 
 
 class FakeNode:
-    """A node of a `FakeGraph`: a `rosasync.ports.NodePort`."""
+    """A node of a `FakeGraph`: a `rosasync._core.ports.NodePort`."""
 
     name = "fake"
     bridge = "fake"
@@ -385,7 +385,7 @@ class FakeNode:
 
 
 class FakeClient:
-    """A client of a `FakeNode`: a `rosasync.ports.ClientPort`.
+    """A client of a `FakeNode`: a `rosasync._core.ports.ClientPort`.
 
     Attributes:
         sent: the numbers of the requests sent, in order.

@@ -11,8 +11,8 @@ from rosasync.session import Session
 from rosasync.testing.graph import FakeGraph, FakeNode
 
 if TYPE_CHECKING:
-    from rosasync.gateway import LoopGateway
-    from rosasync.ports import (
+    from rosasync._core.gateway import LoopGateway
+    from rosasync._core.ports import (
         ClientPort,
         Deliver,
         DeliverRequest,

@@ -60,8 +60,8 @@ def fake_graph() -> FakeGraph:
 
 @pytest.fixture(scope="session")
 def ros_domain() -> int:
-    """A ROS domain that only this test run uses; see `rosasync.ros.domain.isolate`."""
-    from rosasync.ros.domain import isolate_once
+    """A ROS domain that only this test run uses; see `rosasync._ros.domain.isolate`."""
+    from rosasync._ros.domain import isolate_once
 
     return isolate_once()
 

@@ -12,11 +12,11 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-from rosasync.ros.messages import service_type, to_dict, to_message, type_name
+from rosasync._ros.messages import service_type, to_dict, to_message, type_name
 from rosasync.testing.hooks import GraphSession, Hooks
 
 if TYPE_CHECKING:
-    from rosasync.ports import ClientPort, Deliver, Service
+    from rosasync._core.ports import ClientPort, Deliver, Service
     from rosasync.session import Session
     from rosasync.testing.hooks import OpenClient
 
@@ -93,7 +93,7 @@ class Recording:
             services: the type and the name of each service.
         """
         # Only now, because a graph in memory needs no rclpy.
-        from rosasync.ros.inspect import subscribe
+        from rosasync._ros.inspect import subscribe
 
         loop = asyncio.get_running_loop()
         node = session.node
@@ -163,7 +163,7 @@ def _checked(path: str | Path, entry: Any) -> RecordedCall:
 
 
 class _RecordingClient:
-    """A client port that records: a `rosasync.ports.ClientPort`."""
+    """A client port that records: a `rosasync._core.ports.ClientPort`."""
 
     def __init__(
         self, opener: OpenClient, service: Service, deliver: Deliver, recording: Recording

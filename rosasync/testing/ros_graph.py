@@ -13,8 +13,8 @@ from rosasync.testing.hooks import GraphSession, Hooks
 from rosasync.testing.stub import STUB, Answer, StubServer
 
 if TYPE_CHECKING:
-    from rosasync.ports import Service
-    from rosasync.server import ServiceServer
+    from rosasync._core.ports import Service
+    from rosasync._server.server import ServiceServer
     from rosasync.session import Session
     from rosasync.testing.recording import Recording
 
@@ -72,7 +72,7 @@ class Graph:
             RuntimeError: all ROS domains are taken.
         """
         if self._fake is None:
-            from rosasync.ros.domain import isolate_once
+            from rosasync._ros.domain import isolate_once
 
             isolate_once()
         self._stubs = await GraphSession(self._hooks, self._fake, "stubs").__aenter__()

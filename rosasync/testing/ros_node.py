@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from rosasync.ros.node import RosNode
+from rosasync._ros.node import RosNode
 
 if TYPE_CHECKING:
-    from rosasync.gateway import LoopGateway
+    from rosasync._core.gateway import LoopGateway
+    from rosasync._core.ports import ClientPort, Deliver, DeliverRequest, Service, ServicePort
     from rosasync.options import SessionOptions
-    from rosasync.ports import ClientPort, Deliver, DeliverRequest, Service, ServicePort
     from rosasync.testing.hooks import Hooks
 
 __all__ = ["HookedRosNode"]

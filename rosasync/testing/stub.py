@@ -9,13 +9,13 @@ from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self, TypeAlias
 
-from rosasync.ros.messages import service_type, to_dict, to_message
+from rosasync._ros.messages import service_type, to_dict, to_message
 from rosasync.testing.faults import Faults, FaultyService, StubCall, set_in_block
 from rosasync.testing.matching import check_fields, count, describe, difference, matches
 
 if TYPE_CHECKING:
-    from rosasync.server import ServiceServer
-    from rosasync.service_call import ServiceCall
+    from rosasync._server.server import ServiceServer
+    from rosasync._server.service_call import ServiceCall
 
 __all__ = ["Answer", "Match", "StubCall", "StubServer"]
 

@@ -18,7 +18,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 from hypothesis.stateful import run_state_machine_as_test as run_machine
 
 from rosasync import Limits, Retry, RosasyncError
-from rosasync.service_pool import ServicePool
+from rosasync._client.service_pool import ServicePool
 from rosasync.testing import FakeGraph, FakeServer
 from tests.support.plain import Echo, echo
 

@@ -14,7 +14,7 @@ from collections.abc import Awaitable, Callable
 from typing import Literal
 
 from rosasync import CallError, Limits, Retry, Session
-from rosasync.ros.domain import isolate
+from rosasync._ros.domain import isolate
 from tests.support.clients import ClientProcess, Tally
 from tests.support.echo import ECHO, request_of
 from tests.support.servers import ServerProcess

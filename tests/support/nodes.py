@@ -10,10 +10,10 @@ from typing import Any
 import rclpy
 from rclpy.signals import SignalHandlerOptions
 
-from rosasync.gateway import LoopGateway
+from rosasync._core.gateway import LoopGateway
+from rosasync._core.ports import ClientPort, Deliver, DeliverRequest, NodePort, Service, ServicePort
+from rosasync._ros.node import RosNode
 from rosasync.options import Limits, SessionOptions
-from rosasync.ports import ClientPort, Deliver, DeliverRequest, NodePort, Service, ServicePort
-from rosasync.ros.node import RosNode
 from tests.support.echo import ECHO, answer_to
 from tests.support.serving import echo_of
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from diagnostic_msgs.srv import AddDiagnostics
 
 from rosasync import ServiceCall, ServiceServer
-from rosasync.ports import Unmatched
+from rosasync._core.ports import Unmatched
 from tests.support.echo import ECHO, answer_to, request_of
 from tests.support.times import until
 

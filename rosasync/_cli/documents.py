@@ -1,0 +1,190 @@
+"""YAML and JSON of messages, read and written.
+
+A plain scalar is read as its field needs it: the text ``on`` is true in a bool field and the text
+"on" in a string field, ``010`` is ten, and ``1e5`` is a number. YAML 1.1, which PyYAML implements,
+decides that without the field: it would send "True" for ``on`` and 8 for ``010``.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Iterator
+from contextlib import suppress
+from typing import Any
+
+import yaml
+
+from rosasync._ros.messages import FieldType, field_types, to_dict, to_message, type_name
+
+__all__ = ["DocumentError", "documents", "dump_json", "dump_yaml", "plain", "read_message"]
+
+_Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_Dumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+
+_UNREADABLE = re.compile(r"[\x7f-\x9f\u2028\u2029\ufeff\ufffe\uffff]")
+"""Characters that JSON allows in a text and YAML does not, or takes for the end of a line."""
+
+_ONE_LINE = 2**31 - 1
+
+_TRUE = {"true", "yes", "on"}
+_FALSE = {"false", "no", "off"}
+_INTEGER = re.compile(r"[-+]?(0x[0-9a-f_]+|0o[0-7_]+|0b[01_]+|[0-9][0-9_]*)", re.IGNORECASE)
+_FLOATS = {
+    "NaN": math.nan,
+    "Infinity": math.inf,
+    "-Infinity": -math.inf,
+    ".nan": math.nan,
+    ".inf": math.inf,
+    "+.inf": math.inf,
+    "-.inf": -math.inf,
+}
+
+
+class DocumentError(ValueError):
+    """A document that is not a message; the message says where and why."""
+
+
+class _Plain(str):
+    """The text of a scalar without quotes."""
+
+    __slots__ = ()
+
+
+class _TextLoader(_Loader):  # type: ignore[misc]
+    """Reads every plain scalar as its text."""
+
+    yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012
+
+
+def _construct_text(_: Any, node: Any) -> str:
+    return str(node.value) if node.style else _Plain(node.value)
+
+
+_TextLoader.add_constructor("tag:yaml.org,2002:str", _construct_text)
+
+
+class _BlockDumper(_Dumper):  # type: ignore[misc]
+    """Writes mappings as blocks, and lists of numbers and texts in one line."""
+
+    def ignore_aliases(self, data: object) -> bool:
+        return True
+
+
+def _represent_list(dumper: Any, data: list[Any]) -> Any:
+    flat = not any(isinstance(item, dict | list) for item in data)
+    return dumper.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=flat)
+
+
+_BlockDumper.add_representer(list, _represent_list)
+
+
+def read_message(message_type: type[Any], text: str) -> Any:
+    """Read one YAML or JSON document as a message; fields left out keep their defaults.
+
+    Raises:
+        DocumentError: the document is malformed, or does not fit the type.
+    """
+    try:
+        value = yaml.load(text, _TextLoader)
+    except yaml.YAMLError as error:
+        raise DocumentError(f"this is not YAML: {' '.join(str(error).split())}") from None
+    except RecursionError:
+        raise DocumentError("this YAML is nested too deeply") from None
+    if value is None or (isinstance(value, _Plain) and value in ("", "~", "null")):
+        value = {}
+    if not isinstance(value, dict):
+        raise DocumentError(
+            f"expected the fields of {type_name(message_type)} as 'name: value', got {value!r}"
+        )
+    try:
+        return to_message(message_type, _fit_fields(value, message_type))
+    except (TypeError, ValueError) as error:
+        raise DocumentError(str(error)) from None
+
+
+def documents(text: str) -> Iterator[str]:
+    """Split a stream of YAML documents, without reading them. An empty one is left out."""
+    for document in re.split(r"^---(?=\s|$)", text, flags=re.MULTILINE):
+        if any(line.strip() and not line.startswith("#") for line in document.splitlines()):
+            yield document
+
+
+def plain(message: Any) -> dict[str, Any]:
+    """Return the fields of a message as values of YAML and JSON: bytes become numbers."""
+    return _plain_fields(to_dict(message), type(message))
+
+
+def dump_yaml(value: object) -> str:
+    """Return a value as YAML, without the final line break."""
+    text: str = yaml.dump(
+        value, Dumper=_BlockDumper, sort_keys=False, allow_unicode=True, width=_ONE_LINE
+    )
+    return text.removesuffix("\n").removesuffix("\n...")
+
+
+def dump_json(value: object) -> str:
+    """Return a value as one line of JSON; NaN and infinity become texts, which are read again."""
+    text = json.dumps(_finite(value), ensure_ascii=False, allow_nan=False)
+    return _UNREADABLE.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
+
+
+def _fit_fields(values: dict[Any, Any], message_type: type[Any]) -> dict[str, Any]:
+    types = field_types(message_type)
+    return {
+        str(name): _fit(value, types[name]) if name in types else value
+        for name, value in values.items()
+    }
+
+
+def _fit(value: Any, field: FieldType) -> Any:
+    """Return a value as the field needs it. What does not fit is left for `to_message`."""
+    if isinstance(value, dict) and field.message_type is not None:
+        return _fit_fields(value, field.message_type)
+    if isinstance(value, list) and field.element is not None:
+        return [_fit(item, field.element) for item in value]
+    if field.kind == "float" and isinstance(value, str) and value in _FLOATS:
+        return _FLOATS[value]
+    return _fit_text(value, field) if isinstance(value, _Plain) else value
+
+
+def _fit_text(text: _Plain, field: FieldType) -> Any:
+    word = text.lower()
+    if field.kind == "bool" and word in _TRUE | _FALSE:
+        return word in _TRUE
+    if field.kind in ("int", "byte", "float") and _INTEGER.fullmatch(text):
+        return int(text, 0) if text.lstrip("+-")[:2].lower() in ("0x", "0o", "0b") else int(text)
+    if field.kind == "float" and word in _FLOATS:
+        return _FLOATS[word]
+    if field.kind == "float":
+        with suppress(ValueError):
+            return float(text)
+    return str(text)
+
+
+def _plain_fields(values: dict[str, Any], message_type: type[Any]) -> dict[str, Any]:
+    types = field_types(message_type)
+    return {name: _plain_value(value, types[name]) for name, value in values.items()}
+
+
+def _plain_value(value: Any, field: FieldType) -> Any:
+    if field.message_type is not None:
+        return _plain_fields(value, field.message_type)
+    if field.kind == "byte":
+        return value[0]
+    if isinstance(value, bytes):
+        return list(value)
+    if field.element is not None and field.element.kind == "message":
+        return [_plain_value(item, field.element) for item in value]
+    return value
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _finite(item) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_finite(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
+    return value

@@ -1,0 +1,107 @@
+"""Switches service introspection on, on nodes that have the parameter for it."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
+from typing import Any
+
+import rosasync
+from rosasync._cli.graph import POLL, settle
+from rosasync._cli.output import note
+
+__all__ = ["switched_on"]
+
+PARAMETERS = {
+    "server": "service_configure_introspection",
+    "client": "client_configure_introspection",
+}
+"""The parameters of the ROS demo nodes, which other nodes have copied."""
+
+CONTENTS = "contents"
+STRING = 4
+"""PARAMETER_STRING of rcl_interfaces/msg/ParameterType."""
+
+TIMEOUT = 3.0
+
+HOW = """\
+no server or client of {name} publishes introspection, so nothing can be seen. Switch it on with
+  rclpy     service.configure_introspection(node.get_clock(), qos_profile_system_default,
+                                            ServiceIntrospectionState.CONTENTS)
+  rclcpp    service->configure_introspection(node->get_clock(), rclcpp::SystemDefaultsQoS(),
+                                             RCL_SERVICE_INTROSPECTION_CONTENTS)
+  rosasync  Session(introspection="contents")"""
+
+
+@asynccontextmanager
+async def switched_on(session: rosasync.Session, name: str) -> AsyncIterator[None]:
+    """Switch introspection of a service on if no process publishes it, and back at the end.
+
+    If it cannot be switched on, say how.
+    """
+    from rosasync._ros.inspect import client_endpoints, count_publishers, server_endpoints
+
+    await settle(session)
+    switched: list[tuple[str, str, Any]] = []
+    if not count_publishers(session.node, f"{name}/_service_event"):
+        endpoints = [("server", e) for e in server_endpoints(session.node, name)]
+        endpoints += [("client", e) for e in client_endpoints(session.node, name)]
+        for role, node in dict.fromkeys((role, e.node) for role, e in endpoints if e.node):
+            before = await _switch(session, node, PARAMETERS[role])
+            if before is not None:
+                switched.append((node, PARAMETERS[role], before))
+        if not (switched and await _is_published(session, name)):
+            note(HOW.format(name=name))
+    try:
+        yield
+    finally:
+        for node, parameter, before in switched:
+            with suppress(rosasync.RosasyncError, asyncio.CancelledError):
+                await _set(session, node, parameter, before)
+                note(f"{node}: {parameter} is '{before}' again")
+
+
+async def _is_published(session: rosasync.Session, name: str) -> bool:
+    """Wait until introspection of the service is published, and return whether it is."""
+    from rosasync._ros.inspect import count_publishers
+
+    end = time.monotonic() + TIMEOUT
+    while not count_publishers(session.node, f"{name}/_service_event"):
+        if time.monotonic() > end:
+            return False
+        await asyncio.sleep(POLL)
+    return True
+
+
+async def _switch(session: rosasync.Session, node: str, parameter: str) -> str | None:
+    """Make a node publish contents; return its parameter's value before, None if it has none."""
+    from rosasync._ros.inspect import served_types
+
+    if not served_types(session.node, f"{node}/get_parameters"):
+        return None
+    try:
+        answer: Any = await session.call(
+            "rcl_interfaces/srv/GetParameters",
+            f"{node}/get_parameters",
+            {"names": [parameter]},
+            timeout=TIMEOUT,
+        )
+        if not answer.values or answer.values[0].type != STRING:
+            return None
+        await _set(session, node, parameter, CONTENTS)
+    except rosasync.RosasyncError as error:
+        note(f"{node}: {parameter} could not be set: {error}")
+        return None
+    note(f"{node}: {parameter} set to '{CONTENTS}' until the end")
+    return str(answer.values[0].string_value)
+
+
+async def _set(session: rosasync.Session, node: str, parameter: str, value: str) -> None:
+    await session.call(
+        "rcl_interfaces/srv/SetParameters",
+        f"{node}/set_parameters",
+        {"parameters": [{"name": parameter, "value": {"type": STRING, "string_value": value}}]},
+        timeout=TIMEOUT,
+    )

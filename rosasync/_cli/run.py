@@ -1,0 +1,84 @@
+"""Runs a command: its coroutine, its session, and how it ends."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import signal
+import socket
+import sys
+from collections.abc import Coroutine
+from contextlib import suppress
+from typing import Any, Literal
+
+import typer
+
+import rosasync
+from rosasync._cli.errors import CliError, Code, code_of, line_of
+from rosasync._client.mismatch import MISMATCH_LOGGER
+
+__all__ = ["fail", "open_session", "run", "silence_stdout"]
+
+
+def run(command: Coroutine[Any, Any, int | None]) -> None:
+    """Run a command's coroutine to its end, and end the process with its exit code.
+
+    Raises:
+        typer.Exit: always, with the exit code.
+    """
+    # The command ends with an error that says the same.
+    logging.getLogger(MISMATCH_LOGGER).setLevel(logging.ERROR)
+    try:
+        code = asyncio.run(_woken_by_signals(command)) or Code.ANSWERED
+        sys.stdout.flush()
+    except KeyboardInterrupt:
+        code = Code.INTERRUPTED
+    except BrokenPipeError:
+        silence_stdout()
+        code = Code.PIPE_CLOSED
+    except (CliError, rosasync.RosasyncError, ImportError) as error:
+        fail(error)
+        code = code_of(error)
+    raise typer.Exit(int(code))
+
+
+async def _woken_by_signals(command: Coroutine[Any, Any, int | None]) -> int | None:
+    """Await a command, and wake the loop at every signal.
+
+    `asyncio.run` handles Ctrl-C in Python code. An idle loop runs none until its next event, if the
+    signal comes just before it sleeps, or on a thread of the middleware.
+    """
+    loop = asyncio.get_running_loop()
+    reader, writer = socket.socketpair()
+    with reader, writer:
+        reader.setblocking(False)
+        writer.setblocking(False)
+        loop.add_reader(reader, reader.recv, 4096)
+        previous = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
+        try:
+            return await command
+        finally:
+            signal.set_wakeup_fd(previous)
+            loop.remove_reader(reader)
+
+
+def open_session(
+    timeout: float | None = None, introspection: Literal["off", "contents"] = "off"
+) -> rosasync.Session:
+    """Return a session to open, on a node that is hidden from listings."""
+    return rosasync.Session(
+        f"_rosasync_{os.getpid()}", timeout=timeout, introspection=introspection
+    )
+
+
+def fail(error: BaseException | str) -> None:
+    """Print an error as one line to standard error."""
+    text = error if isinstance(error, str) else line_of(error)
+    with suppress(OSError):
+        print(f"rosasync: {text}", file=sys.stderr, flush=True)
+
+
+def silence_stdout() -> None:
+    """Let what is still buffered go nowhere, because the reader has closed the pipe."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

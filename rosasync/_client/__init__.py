@@ -1,0 +1,1 @@
+"""Everything between a call and the port that sends it."""

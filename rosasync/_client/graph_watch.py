@@ -1,0 +1,149 @@
+"""Watches the ROS graph: its generations, and polling while callers wait."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Protocol
+
+from rosasync.errors import ContextShutdown
+
+if TYPE_CHECKING:
+    from rosasync._core.ports import NodePort
+
+__all__ = ["GraphWatch", "Watcher"]
+
+POLL_MIN = 0.002
+"""Seconds until the first poll for a match, which takes milliseconds."""
+POLL_MAX = 0.25
+"""Maximum number of seconds between two polls while callers wait for a match."""
+POLL_CONTEXT = 0.5
+"""Seconds between two polls of the context while requests are outstanding. They are needed because
+rclpy's signal handler shuts a context down without an event."""
+
+
+class Watcher(Protocol):
+    """A service that depends on the graph."""
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether there are callers, or requests without a caller."""
+
+    @property
+    def awaits_match(self) -> bool:
+        """Whether callers wait for a client to be matched."""
+
+    def on_graph(self) -> None:
+        """Check the graph again.
+
+        Raises:
+            ContextShutdown: the node is down.
+        """
+
+
+class GraphWatch:
+    """Makes the services of a pool check the graph again when it may have changed.
+
+    Confined to the loop's thread. A change of the graph begins a new generation, in which the match
+    of every client is checked again. A match is not an event of the graph, so one timer for all
+    services polls for it. The timer starts when a caller waits for a match or a request is sent,
+    and stops when a poll finds neither callers nor requests.
+
+    Attributes:
+        generation: counts the changes of the graph.
+        polling: whether the timer runs.
+    """
+
+    def __init__(
+        self,
+        node: NodePort,
+        services: Collection[Watcher],
+        on_shutdown: Callable[[], object],
+    ) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._node = node
+        self._services = services
+        self._on_shutdown = on_shutdown
+        self.generation = 0
+        self.polling = False
+        self._timer: asyncio.TimerHandle | None = None
+        self._delay = POLL_MIN
+        self._closed = False
+
+    def changed(self) -> None:
+        """Begin a new generation: the graph has changed."""
+        if self._closed:
+            return
+        self.advance()
+        self._check_services()
+        if any(service.awaits_match for service in self._services):
+            self.poll_soon()
+
+    def advance(self) -> None:
+        """Begin a new generation without checking the services."""
+        self.generation += 1
+
+    def poll_soon(self) -> None:
+        """Poll after `POLL_MIN` seconds, then at growing intervals while callers wait."""
+        self._delay = POLL_MIN
+        self._poll_in(POLL_MIN)
+
+    def keep_polling(self) -> None:
+        """Start the timer unless it runs."""
+        if not self.polling and not self._closed:
+            if not self._node.graph_events:
+                self.advance()
+            self._poll_in(POLL_CONTEXT)
+
+    def close(self) -> None:
+        """Stop the timer; idempotent."""
+        self._closed = True
+        self.polling = False
+        if self._timer is not None:
+            self._timer.cancel()
+
+    def _poll_in(self, delay: float) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        if not self._closed:
+            self.polling = True
+            self._timer = self._loop.call_later(delay, self._poll)
+
+    def _poll(self) -> None:
+        self._timer = None
+        if not self._node.ok():
+            self.polling = False
+            self._on_shutdown()
+            return
+        if not self._node.graph_events:
+            self.advance()
+        # `polling` stays set during this, because a dispatch would start the slow timer otherwise.
+        try:
+            self._check_services()
+        finally:
+            self._poll_again()
+
+    def _poll_again(self) -> None:
+        if self._timer is not None or self._closed:
+            return
+        if any(service.awaits_match for service in self._services):
+            self._delay = min(self._delay * 2, POLL_MAX)
+            self._poll_in(self._delay)
+        elif any(service.is_busy for service in self._services):
+            self._poll_in(POLL_CONTEXT)
+        else:
+            self.polling = False
+
+    @contextmanager
+    def reports_shutdown(self) -> Iterator[None]:
+        """Report a `ContextShutdown` that the block raises, and suppress it."""
+        try:
+            yield
+        except ContextShutdown:
+            self._on_shutdown()
+
+    def _check_services(self) -> None:
+        with self.reports_shutdown():
+            for service in tuple(self._services):
+                service.on_graph()

@@ -1,0 +1,274 @@
+"""ClientPool: one set of clients for each service, shared by all callers."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from typing import TYPE_CHECKING, Any, Generic, overload
+
+from rosasync._client.graph_watch import GraphWatch
+from rosasync._client.latency import summarize
+from rosasync._client.service_pool import MATCH_TIMEOUT, ServicePool
+from rosasync._core.aio import Deadlines
+from rosasync.errors import UsageError
+from rosasync.options import check_count, check_timeout
+from rosasync.statistics import KeyStatistics, PoolStatistics, ServiceKey
+from rosasync.typing import RequestT, ResponseT
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from rclpy.qos import QoSProfile
+
+    from rosasync._client.client import Client
+    from rosasync._core.arguments import ArgumentChecker
+    from rosasync._core.ports import NodePort, Service
+    from rosasync.options import Limits, Retry
+    from rosasync.tracing import Tracing
+    from rosasync.typing import ServiceType, Timeout
+
+__all__ = ["ClientPool", "LeasedClient"]
+
+
+class ClientPool:
+    """Leases clients for each service, and takes them back after each call.
+
+    The pool of a session is ``session.pool``. Use it on the loop's thread.
+    """
+
+    def __init__(
+        self,
+        node: NodePort,
+        arguments: ArgumentChecker,
+        limits: Limits,
+        timeout: float | None,
+        on_shutdown: Callable[[], object],
+        tracing: Tracing,
+    ) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._node = node
+        self._arguments = arguments
+        self._limits = limits
+        self._timeout = timeout
+        self._tracing = tracing
+        self._opened = self._loop.time()
+        self._services: dict[ServiceKey, ServicePool] = {}
+        # Repeated calls find their service here by the type and name as given, unresolved.
+        self._shortcuts: dict[tuple[Any, str], ServicePool] = {}
+        self._deadlines = Deadlines()
+        self._watch = GraphWatch(node, self._services.values(), on_shutdown)
+        self._ending: Callable[[], Exception] | None = None
+
+    def __repr__(self) -> str:
+        total = self.statistics()
+        return (
+            f"<ClientPool {len(self._services)} services, {total.clients} clients, "
+            f"{total.idle} idle, {total.in_flight} in flight, {total.waiting} waiting>"
+        )
+
+    @overload
+    def lease(
+        self,
+        srv_type: ServiceType[RequestT, ResponseT],
+        srv_name: str,
+        *,
+        qos: QoSProfile | None = None,
+        timeout: Timeout = ...,
+    ) -> AbstractAsyncContextManager[LeasedClient[RequestT, ResponseT]]: ...
+
+    @overload
+    def lease(
+        self,
+        srv_type: str,
+        srv_name: str,
+        *,
+        qos: QoSProfile | None = None,
+        timeout: Timeout = ...,
+    ) -> AbstractAsyncContextManager[LeasedClient[Any, Any]]: ...
+
+    @asynccontextmanager
+    async def lease(
+        self,
+        srv_type: Any,
+        srv_name: str,
+        *,
+        qos: QoSProfile | None = None,
+        timeout: Timeout = ...,
+    ) -> AsyncIterator[LeasedClient[Any, Any]]:
+        """Lease a client, and always return it to the pool, also after an error or a cancellation.
+
+        A lease takes one place in the client's window: it carries one call at a time.
+
+        Args:
+            srv_type: a service class or its name.
+            srv_name: the service's name.
+            qos: a ``QoSProfile``; None for the service default.
+            timeout: seconds to wait for a client, None for no deadline; if left out, the session's.
+
+        Raises:
+            ServiceUnavailable: there was no server in time.
+            QueueTimeout: no client became free in time.
+            PoolFull: more callers wait than `Limits.waiting` allows.
+            SessionClosed, ContextShutdown: the session has ended.
+        """
+        service = self.service(srv_type, srv_name, qos)
+        client = await service.lease(check_timeout(timeout, self._timeout))
+        leased: LeasedClient[Any, Any] = LeasedClient(
+            self._arguments, service, client, self._timeout
+        )
+        try:
+            yield leased
+        finally:
+            leased.end()
+
+    async def warm(
+        self, srv_type: ServiceType[Any, Any] | str, srv_name: str, clients: int = 1
+    ) -> None:
+        """Create clients before the first call, and match them with the server if there is one.
+
+        Args:
+            srv_type: a service class or its name.
+            srv_name: the service's name.
+            clients: the number of clients to have, at most `Limits.clients`.
+
+        Raises:
+            ValueError: more clients than `Limits.clients` allows.
+            SessionClosed, ContextShutdown: the session has ended.
+        """
+        clients = check_count("clients", clients, 1)
+        if clients > self._limits.clients:
+            raise ValueError(
+                f"clients={clients} is more than Limits.clients={self._limits.clients}: raise the "
+                "limit of the session, Session(limits=Limits(clients=…))"
+            )
+        service = self.service(srv_type, srv_name, None)
+        # A session that was just opened does not know the graph yet.
+        since = self._loop.time() if service.is_provided() else self._opened
+        await service.warm(clients, since + MATCH_TIMEOUT)
+
+    def statistics(self) -> PoolStatistics:
+        """Take a snapshot of the pool, in total and for each service."""
+        keys = {key: service.statistics() for key, service in self._services.items()}
+        names = [name for name in KeyStatistics.__dataclass_fields__ if name != "latency"]
+        total = {name: sum(getattr(s, name) for s in keys.values()) for name in names}
+        latency = summarize(service.latencies for service in self._services.values())
+        return PoolStatistics(**total, latency=latency, keys=keys)
+
+    # For the session.
+
+    def service(self, srv_type: Any, srv_name: str, qos: QoSProfile | None) -> ServicePool:
+        """Return the pool of one service, created at its first use.
+
+        Raises:
+            TypeError, ValueError: the service type does not exist, or the QoS is not a
+                ``QoSProfile``.
+            InvalidServiceName: ROS does not allow the name.
+            SessionClosed, ContextShutdown: the session has ended.
+        """
+        if qos is None:
+            try:
+                return self._shortcuts[srv_type, srv_name]
+            except (KeyError, TypeError):
+                pass
+        pool = self.service_of(self._arguments.service(srv_type, srv_name, qos))
+        if qos is None:
+            self._shortcuts[srv_type, srv_name] = pool
+        return pool
+
+    def service_of(self, service: Service) -> ServicePool:
+        """Return the pool of one service, created at its first use.
+
+        Raises:
+            SessionClosed, ContextShutdown: the session has ended.
+        """
+        self.check_open()
+        pool = self._services.get(service.key)
+        if pool is None:
+            pool = ServicePool(
+                service, self._node, self._limits, self._watch, self._deadlines, self._tracing
+            )
+            self._services[service.key] = pool
+        return pool
+
+    def graph_changed(self) -> None:
+        """Make the services check the ROS graph again, because it has changed."""
+        self._watch.changed()
+
+    def check_open(self) -> None:
+        """Raise the error that calls get, once the session has ended."""
+        if self._ending is not None:
+            raise self._ending()
+
+    def end(self, ending: Callable[[], Exception]) -> None:
+        """End every call with the error that ``ending`` makes, and destroy the clients.
+
+        If it is called again, calls made afterwards get the new error.
+        """
+        self._ending = ending
+        self._watch.close()
+        self._deadlines.close()
+        for service in self._services.values():
+            service.end(ending)
+        self._shortcuts.clear()
+
+
+class LeasedClient(Generic[RequestT, ResponseT]):
+    """A client on lease: one call at a time, until the lease ends."""
+
+    __slots__ = ("_arguments", "_busy", "_client", "_service", "_timeout", "closed")
+
+    def __init__(
+        self,
+        arguments: ArgumentChecker,
+        service: ServicePool,
+        client: Client,
+        timeout: float | None,
+    ) -> None:
+        self._arguments = arguments
+        self._service = service
+        self._client = client
+        self._timeout = timeout
+        self._busy = False
+        self.closed = False
+
+    def __repr__(self) -> str:
+        state = "closed" if self.closed else "busy" if self._busy else "idle"
+        return f"<LeasedClient {self._service.service.key.srv_name} {state}>"
+
+    async def call(
+        self,
+        request: RequestT | Mapping[str, Any] | None = None,
+        *,
+        timeout: Timeout = ...,
+        retry: Retry | None = None,
+    ) -> ResponseT:
+        """Call the service with this client; for the arguments and errors, see `Session.call`.
+
+        Raises:
+            UsageError: the lease has ended, or another call of it is in progress.
+        """
+        if self.closed or self._busy:
+            name = self._service.service.key.srv_name
+            problem = "is over" if self.closed else "carries one call at a time"
+            raise UsageError(f"{name}: the lease {problem}: take another one")
+        self._busy = True
+        try:
+            service = self._service
+            message, seconds = self._arguments.call(
+                service.service, request, timeout, self._timeout, retry=retry
+            )
+            response: ResponseT = await service.call(
+                message, seconds, retry=retry, leased=self._client
+            )
+            return response
+        finally:
+            self._busy = False
+            if self.closed:
+                self._client.release()
+
+    def end(self) -> None:
+        """End the lease. A call that is still in progress keeps the place until it ends."""
+        self.closed = True
+        if not self._busy:
+            self._client.release()

@@ -1,0 +1,207 @@
+"""The parts of an open session, and how they end together."""
+
+from __future__ import annotations
+
+import _thread
+import asyncio
+import atexit
+import logging
+import threading
+import warnings
+import weakref
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import anyio
+
+from rosasync._client.pool import ClientPool
+from rosasync._core.aio import until_done
+from rosasync._core.arguments import ArgumentChecker
+from rosasync._core.gateway import LoopGateway
+from rosasync._core.portal import Portal
+from rosasync._server.server import ServiceServer
+from rosasync.errors import ContextShutdown, SessionClosed, UsageError
+from rosasync.tracing import Tracing
+
+if TYPE_CHECKING:
+    from rosasync._core.ports import NodePort
+    from rosasync.options import SessionOptions
+
+__all__ = ["Core", "OpenNode"]
+
+logger = logging.getLogger("rosasync")
+
+END_TIMEOUT = 5.0
+"""Seconds to wait for a running callback of the node before its thread is left behind."""
+
+OpenNode = Callable[[LoopGateway, Callable[[], None], Callable[[], None]], "NodePort"]
+"""Opens a node. Takes the gateway, and the callbacks for graph changes and context shutdown."""
+
+
+class Core:
+    """The parts of an open session. It does not refer to the session itself.
+
+    So a session that is dropped unclosed is garbage-collected, warns, and ends its thread.
+    """
+
+    def __init__(self, session: object, options: SessionOptions, open_node: OpenNode) -> None:
+        self.loop = asyncio.get_running_loop()
+        self.timeout = options.timeout
+        self.gateway = LoopGateway()
+        self.node = open_node(self.gateway, self._graph_changed, self._context_shut_down)
+        self.name = self.node.name
+        self.arguments = ArgumentChecker(self.node)
+        self.tracing = Tracing(options.trace)
+        self.pool = ClientPool(
+            self.node,
+            self.arguments,
+            options.limits,
+            options.timeout,
+            self._context_shut_down,
+            self.tracing,
+        )
+        self.portal = Portal(self.node, self.gateway, self.arguments, self.pool, options.timeout)
+        # A server removes itself when it ends, by its `on_end`.
+        self.servers: dict[ServiceServer[Any, Any], None] = {}
+        self.closed = False
+        self._session = weakref.ref(session)
+        self._end_task: asyncio.Task[None] | None = None
+        self._cleaned_up = threading.Event()
+        atexit.register(self._exit)
+
+    def check_loop(self) -> None:
+        """Raise `UsageError` on any other loop or thread than the session's."""
+        if asyncio._get_running_loop() is not self.loop:
+            raise UsageError(self._explain_loop())
+
+    def _explain_loop(self) -> str:
+        """Return what is wrong with the caller's loop or thread, and what to do."""
+        name = f"session {self.name!r}"
+        if not self.gateway.on_thread:
+            return f"{name} belongs to the loop of another thread: use session.from_thread here"
+        if asyncio._get_running_loop() is None:
+            return f"{name} is used without a running event loop: use it in a coroutine of its loop"
+        return (
+            f"{name} belongs to another event loop, and asyncio.run makes a new one each time: "
+            "open a session in each loop, or run everything in one"
+        )
+
+    def serve(
+        self, srv_type: Any, srv_name: str, handler: Any, **options: Any
+    ) -> ServiceServer[Any, Any]:
+        """Create a server that ends with the session."""
+        if self.closed:
+            raise session_closed()
+        self.pool.check_open()
+        server = ServiceServer[Any, Any](
+            self.node,
+            srv_type,
+            srv_name,
+            handler,
+            on_end=self.servers.pop,
+            tracing=self.tracing,
+            **options,
+        )
+        self.servers[server] = None
+        return server
+
+    async def aclose(self) -> None:
+        """End everything; idempotent. All callers wait for the same task."""
+        self.closed = True
+        # Before the task is created, because an eager one closes the servers at once.
+        for server in self.servers:
+            server.exclude_caller()
+        if self._end_task is None:
+            self._end_task = self.loop.create_task(self._end())
+        await until_done(self._end_task)
+
+    def abandon(self, session: object) -> None:
+        """Clean up after a session that was never closed. From any thread, for ``__del__``.
+
+        The garbage collector may run this while the thread holds any lock. So it takes none, which
+        also rules out a ``threading.Thread``.
+        """
+        _warn_unclosed(session)
+        self.closed = True
+        self.node.stop()
+        try:
+            self.loop.call_soon_threadsafe(self._abandon)
+        except RuntimeError:
+            # The loop is closed.
+            _thread.start_new_thread(self._clean_up, ())
+
+    def _abandon(self) -> None:
+        self.pool.end(session_closed)
+        self._clean_up()
+
+    def _clean_up(self) -> None:
+        self.gateway.close()
+        self._end_servers(session_closed)
+        if self.node.join():
+            self.node.close()
+        atexit.unregister(self._exit)
+        self._cleaned_up.set()
+
+    def _exit(self) -> None:
+        """End the executor thread, because the interpreter aborts if it exits while one spins."""
+        session = self._session()
+        if session is not None and not self.closed:
+            _warn_unclosed(session)
+            self.closed = True
+        elif self.closed and self._end_task is None and self.loop.is_closed():
+            self._cleaned_up.wait(END_TIMEOUT)
+        self.node.stop()
+        self.gateway.close()
+        self.node.join()
+
+    async def _end(self) -> None:
+        # Each step also if the end of the loop cancels this task, as `asyncio.run` does.
+        try:
+            await asyncio.gather(*(server.aclose() for server in self.servers))
+        finally:
+            self.pool.end(session_closed)
+            self._end_servers(session_closed)
+            self.node.stop()
+            self.gateway.close()
+            await self._close_node()
+
+    async def _close_node(self) -> None:
+        stuck = False
+        try:
+            with anyio.move_on_after(END_TIMEOUT, shield=True) as scope:
+                await self.node.stopped()
+            stuck = scope.cancelled_caught
+        finally:
+            if not stuck and self.node.join():
+                self.node.close()
+            else:
+                logger.warning(
+                    "a callback of node %s still runs after %g s, so the executor thread is left "
+                    "behind: find a callback of the node that blocks",
+                    self.name,
+                    END_TIMEOUT,
+                )
+            # Last: if a second Ctrl-C interrupts the end, the interpreter's exit completes it.
+            atexit.unregister(self._exit)
+
+    def _graph_changed(self) -> None:
+        self.pool.graph_changed()
+        for server in tuple(self.servers):
+            server.check_port()
+
+    def _context_shut_down(self) -> None:
+        self.pool.end(ContextShutdown)
+        self._end_servers(ContextShutdown)
+
+    def _end_servers(self, ending: Callable[[], Exception]) -> None:
+        for server in tuple(self.servers):
+            server.end(ending)
+
+
+def session_closed() -> SessionClosed:
+    """Make the error for a session that has been closed."""
+    return SessionClosed("the session is closed: open a new one")
+
+
+def _warn_unclosed(session: object) -> None:
+    warnings.warn(f"unclosed {session!r}", ResourceWarning, source=session, stacklevel=2)

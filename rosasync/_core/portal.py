@@ -1,0 +1,325 @@
+"""Portal: calls from threads other than the loop's, as ``session.from_thread``."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import contextvars
+import threading
+import time
+from collections.abc import Mapping
+from concurrent.futures import CancelledError, Future, InvalidStateError
+from copy import deepcopy
+from typing import TYPE_CHECKING, Any, overload
+
+from rosasync.errors import ResponseTimeout, SessionClosed, UsageError
+from rosasync.typing import RequestT, ResponseT, ServiceType, Timeout
+
+if TYPE_CHECKING:
+    from rclpy.qos import QoSProfile
+
+    from rosasync._client.pool import ClientPool
+    from rosasync._core.arguments import ArgumentChecker
+    from rosasync._core.gateway import LoopGateway
+    from rosasync._core.ports import NodePort, Service
+    from rosasync.options import Retry
+
+__all__ = ["Portal"]
+
+POLL_LOOP = 0.5
+"""Seconds after which a blocked thread checks again whether the loop has been closed."""
+
+MARGIN = 1.0
+"""Seconds after its deadline for which a blocked thread waits for the loop to report it."""
+
+
+class Portal:
+    """Calls services from threads other than the loop's: ``session.from_thread``.
+
+    For worker threads, GUI toolkits and libraries that block; in the loop, use `Session.call`. On
+    the loop's own thread, and on the session's executor thread (which runs the node's callbacks), a
+    call would deadlock and raises `UsageError`. If another executor spins the node, do not block in
+    its callbacks either.
+    """
+
+    def __init__(
+        self,
+        node: NodePort,
+        gateway: LoopGateway,
+        arguments: ArgumentChecker,
+        pool: ClientPool,
+        timeout: float | None,
+    ) -> None:
+        self._node = node
+        self._gateway = gateway
+        self._arguments = arguments
+        self._pool = pool
+        self._timeout = timeout
+
+    def __repr__(self) -> str:
+        state = "closed" if self._gateway.closed else "open"
+        return f"<Portal to the session of node {self._node.name!r}, {state}>"
+
+    @overload
+    def call(
+        self,
+        srv_type: ServiceType[RequestT, ResponseT],
+        srv_name: str,
+        request: RequestT | Mapping[str, Any] | None = None,
+        *,
+        timeout: Timeout = ...,
+        qos: QoSProfile | None = None,
+        wait: bool = True,
+        retry: Retry | None = None,
+    ) -> ResponseT: ...
+
+    @overload
+    def call(
+        self,
+        srv_type: str,
+        srv_name: str,
+        request: Any = None,
+        *,
+        timeout: Timeout = ...,
+        qos: QoSProfile | None = None,
+        wait: bool = True,
+        retry: Retry | None = None,
+    ) -> Any: ...
+
+    def call(
+        self,
+        srv_type: Any,
+        srv_name: str,
+        request: Any = None,
+        *,
+        timeout: Timeout = ...,
+        qos: QoSProfile | None = None,
+        wait: bool = True,
+        retry: Retry | None = None,
+    ) -> Any:
+        """Call a service, block this thread until the response arrives, and return it.
+
+        For the arguments and errors, see `Session.call`. It also ends when the session closes, and
+        a second after the deadline if the loop is blocked.
+
+        Raises:
+            UsageError: on the loop's thread, or the executor's: it would deadlock.
+        """
+        submission = self._submission(srv_type, srv_name, request, timeout, qos, wait, retry)
+        submission.submit()
+        return submission.wait()
+
+    @overload
+    def submit(
+        self,
+        srv_type: ServiceType[RequestT, ResponseT],
+        srv_name: str,
+        request: RequestT | Mapping[str, Any] | None = None,
+        *,
+        timeout: Timeout = ...,
+        qos: QoSProfile | None = None,
+        wait: bool = True,
+        retry: Retry | None = None,
+    ) -> Future[ResponseT]: ...
+
+    @overload
+    def submit(
+        self,
+        srv_type: str,
+        srv_name: str,
+        request: Any = None,
+        *,
+        timeout: Timeout = ...,
+        qos: QoSProfile | None = None,
+        wait: bool = True,
+        retry: Retry | None = None,
+    ) -> Future[Any]: ...
+
+    def submit(
+        self,
+        srv_type: Any,
+        srv_name: str,
+        request: Any = None,
+        *,
+        timeout: Timeout = ...,
+        qos: QoSProfile | None = None,
+        wait: bool = True,
+        retry: Retry | None = None,
+    ) -> Future[Any]:
+        """Start the same call and return at once. Cancelling the future cancels the call.
+
+        The request is copied, so it may be changed afterwards. For the arguments, see
+        `Session.call`. Wrong arguments raise here, everything later is raised by the future.
+
+        Raises:
+            UsageError: on the loop's thread, or the executor's. Use an `AsyncServiceProxy` or
+                ``asyncio.run_coroutine_threadsafe`` there.
+            SessionClosed: the session is closed.
+        """
+        submission = self._submission(
+            srv_type, srv_name, request, timeout, qos, wait, retry, copy=request is not None
+        )
+        submission.submit()
+        return submission
+
+    def _submission(
+        self,
+        srv_type: Any,
+        srv_name: str,
+        request: Any,
+        timeout: Timeout,
+        qos: QoSProfile | None,
+        wait: bool,
+        retry: Retry | None,
+        copy: bool = False,
+    ) -> _Submission:
+        self._check_thread()
+        service = self._arguments.service(srv_type, srv_name, qos)
+        message, seconds = self._arguments.call(
+            service, request, timeout, self._timeout, wait, retry
+        )
+        if copy:
+            message = deepcopy(message)
+        return _Submission(self._gateway, self._pool, service, message, seconds, wait, retry)
+
+    def _check_thread(self) -> None:
+        self._gateway.check_open()
+        if self._gateway.on_thread or self._gateway.on_loop:
+            raise UsageError(
+                "session.from_thread would block the session's own loop: use await session.call"
+            )
+        if self._node.executor_thread == threading.get_ident():
+            raise UsageError(
+                "session.from_thread would block the executor's thread, which runs this callback: "
+                "use asyncio.run_coroutine_threadsafe(session.call(…), loop) or an "
+                "AsyncServiceProxy"
+            )
+
+
+class _Submission(Future[Any]):
+    """A call that another thread waits for.
+
+    The loop, the end of the session and a cancellation may each complete it. The first one wins.
+    """
+
+    def __init__(
+        self,
+        gateway: LoopGateway,
+        pool: ClientPool,
+        service: Service,
+        request: Any,
+        timeout: float | None,
+        wait: bool,
+        retry: Retry | None,
+    ) -> None:
+        super().__init__()
+        self._gateway = gateway
+        self._pool = pool
+        self._service = service
+        self._request = request
+        self._timeout = timeout
+        self._wait = wait
+        self._retry = retry
+        self._submitted = time.monotonic()
+        # The call runs in the context of its caller, for a trace.
+        self._context = contextvars.copy_context()
+        self._task: asyncio.Task[None] | None = None
+
+    def submit(self) -> None:
+        """Pass the call to the loop.
+
+        Raises:
+            SessionClosed: the session is closed.
+        """
+        self._gateway.register(self)
+        try:
+            self._gateway.post(self._start)
+        except SessionClosed:
+            self._gateway.discard(self)
+            raise
+        self.add_done_callback(self._on_done)
+
+    def fail(self, error: Exception) -> None:
+        """End with an error, unless it has ended already."""
+        with contextlib.suppress(InvalidStateError):
+            self.set_exception(error)
+
+    def result(self, timeout: float | None = None) -> Any:
+        """Wait as ``concurrent.futures.Future.result`` does, also if the loop has vanished."""
+        self._watch(timeout)
+        return super().result(0)
+
+    def exception(self, timeout: float | None = None) -> BaseException | None:
+        """Wait as ``concurrent.futures.Future.exception`` does, also if the loop has vanished."""
+        self._watch(timeout)
+        return super().exception(0)
+
+    def wait(self) -> Any:
+        """Return the response, at most `MARGIN` seconds after the deadline.
+
+        If the wait ends otherwise, for example by a KeyboardInterrupt, the call is cancelled.
+        """
+        try:
+            self._watch(None if self._timeout is None else self._timeout + MARGIN)
+            if self.done():
+                return super().result()
+        except BaseException:
+            self.cancel()
+            raise
+        self.cancel()
+        elapsed = time.monotonic() - self._submitted
+        srv_name, srv_type, _ = self._service.key
+        raise ResponseTimeout(
+            f"{srv_name}: the session's loop is stuck: it did not react for {elapsed:.3g} s, so a "
+            "task or a callback blocks it",
+            srv_name=srv_name,
+            srv_type=srv_type,
+            elapsed=elapsed,
+        )
+
+    def _watch(self, timeout: float | None) -> None:
+        """Wait until this is done, the loop is closed, or ``timeout`` seconds have passed."""
+        ends = None if timeout is None else time.monotonic() + timeout
+        while not self.done():
+            left = POLL_LOOP if ends is None else min(POLL_LOOP, ends - time.monotonic())
+            if left <= 0:
+                return
+            with contextlib.suppress(TimeoutError, CancelledError):
+                super().exception(left)
+            if self._gateway.loop.is_closed():
+                self.fail(SessionClosed("the session's loop was closed"))
+
+    def _on_done(self, _: Future[Any]) -> None:
+        """Cancel the call if the future was cancelled. Runs once, on the thread that ended it."""
+        self._gateway.discard(self)
+        if self.cancelled():
+            # concurrent.futures.wait and as_completed see the cancellation only now.
+            self.set_running_or_notify_cancel()
+            with contextlib.suppress(SessionClosed):
+                self._gateway.call(self._cancel)
+
+    # On the loop's thread.
+
+    def _start(self) -> None:
+        if not self.done():
+            self._task = self._context.run(self._gateway.loop.create_task, self._call())
+
+    def _cancel(self) -> None:
+        if self._task is not None:
+            self._task.cancel()
+
+    async def _call(self) -> None:
+        seconds = self._timeout
+        if seconds is not None:
+            seconds = max(0.0, seconds - (time.monotonic() - self._submitted))
+        try:
+            service = self._pool.service_of(self._service)
+            response = await service.call(self._request, seconds, self._wait, self._retry)
+        except asyncio.CancelledError:
+            self.fail(SessionClosed("the session's loop has ended"))
+            raise
+        except Exception as error:
+            self.fail(error)
+        else:
+            with contextlib.suppress(InvalidStateError):
+                self.set_result(response)

@@ -1,0 +1,267 @@
+"""Protocols for what the core needs from rclpy; `rosasync._ros` implements them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from rosasync.statistics import ServiceKey
+
+__all__ = [
+    "ClientPort",
+    "Deliver",
+    "DeliverRequest",
+    "NodePort",
+    "PortDestroyed",
+    "RequestHeader",
+    "RequestId",
+    "Servers",
+    "Service",
+    "ServicePort",
+    "Undeliverable",
+    "Unmatched",
+]
+
+Deliver = Callable[[int, Any], None]
+"""Called on the loop's thread with a sequence number and the response to it."""
+
+
+Servers = frozenset[Hashable]
+"""The identities of servers."""
+
+
+class PortDestroyed(Exception):
+    """The rclpy client or service was destroyed by something other than rosasync."""
+
+
+class Undeliverable(Exception):
+    """The middleware cannot deliver this response."""
+
+
+class Unmatched(Undeliverable):
+    """The client has not been discovered completely yet: send the response again later."""
+
+
+@dataclass(frozen=True, slots=True)
+class Service:
+    """A service type, name and QoS, checked and resolved.
+
+    Attributes:
+        srv_type: the service class.
+        srv_name: the name as given. rclpy resolves it again, and must not remap it twice.
+        qos: the ``QoSProfile``, or None for the default.
+        key: the key of the service in the pool.
+    """
+
+    srv_type: Any
+    srv_name: str
+    qos: Any
+    key: ServiceKey
+
+
+class RequestId(Protocol):
+    """The identity of a request. rclpy exposes its number, but not its client."""
+
+    @property
+    def sequence_number(self) -> int:
+        """The number that the client gave the request."""
+
+
+class RequestHeader(Protocol):
+    """The header of a request. Keep the object: it is needed to send the response."""
+
+    @property
+    def request_id(self) -> RequestId:
+        """The identity of the request."""
+
+    @property
+    def source_timestamp(self) -> int:
+        """When the request was sent, in ns; 0 or less if unknown."""
+
+    @property
+    def received_timestamp(self) -> int:
+        """When the request was received, in ns; 0 or less if unknown."""
+
+
+DeliverRequest = Callable[[Any, RequestHeader], None]
+"""Called on the loop's thread with a request and its header."""
+
+
+class ServicePort(Protocol):
+    """One rcl service.
+
+    Every method returns at once. Call them on the loop's thread, unless they say otherwise.
+    """
+
+    @property
+    def handle(self) -> Any:
+        """The ``rclpy.service.Service``."""
+
+    @property
+    def qos(self) -> Any:
+        """The ``QoSProfile`` in use."""
+
+    @property
+    def destroy_delay(self) -> float:
+        """Seconds to wait between `stop` and `close`, unless the server has to end at once."""
+
+    @property
+    def destroyed(self) -> bool:
+        """Whether something other than rosasync has destroyed the service."""
+
+    def send(self, header: RequestHeader, response: Any) -> None:
+        """Convert and send a response. From any thread, but not during or after `close`.
+
+        Raises:
+            Undeliverable: the client cannot get the response.
+            Unmatched: the client cannot get it yet.
+            PortDestroyed: the service was destroyed.
+        """
+
+    def has_clients(self) -> bool:
+        """Return whether the graph shows a client. From any thread, but not during `close`."""
+
+    def delivered(self) -> bool:
+        """Return whether every client is known to have received every response.
+
+        False also if the middleware cannot tell.
+
+        Raises:
+            PortDestroyed: the service was destroyed.
+            ContextShutdown: the node is down.
+        """
+
+    def stop(self) -> None:
+        """Stop delivering requests; idempotent. Responses may still be sent."""
+
+    def close(self) -> None:
+        """Destroy the service; idempotent."""
+
+
+class ClientPort(Protocol):
+    """One rcl client. Call its methods on the loop's thread; every one returns at once."""
+
+    def send(self, request: Any) -> int:
+        """Send a request and return its sequence number, which grows with every send.
+
+        Raises:
+            PortDestroyed: the client was destroyed.
+        """
+
+    def forget(self, sequence_number: int) -> None:
+        """Stop expecting a response to this request."""
+
+    def ready(self) -> bool:
+        """Return whether a server is matched, so that it would receive a request sent now.
+
+        Raises:
+            PortDestroyed: the client was destroyed.
+        """
+
+    def close(self) -> None:
+        """Destroy the client; idempotent."""
+
+
+class NodePort(Protocol):
+    """One node, with its executor thread and its bridge.
+
+    Call the methods on the loop's thread, unless they say otherwise. All but `join` return at once.
+    """
+
+    @property
+    def name(self) -> str:
+        """The node's name."""
+
+    @property
+    def node(self) -> Any:
+        """The ``rclpy.node.Node``."""
+
+    @property
+    def bridge(self) -> str:
+        """The bridge in use: ``"direct"`` or ``"executor"``."""
+
+    @property
+    def executor_thread(self) -> int | None:
+        """The identifier of the executor thread, if the session started it."""
+
+    @property
+    def graph_events(self) -> bool:
+        """Whether the node reports changes of the graph. If not, the pool polls."""
+
+    def ok(self) -> bool:
+        """Return whether the node and its context are up."""
+
+    def describe(self, srv_type: Any, srv_name: str, qos: Any) -> Service:
+        """Check and resolve a service. From any thread.
+
+        Raises:
+            TypeError, ValueError: the type does not exist, or the QoS is not a ``QoSProfile``.
+            InvalidServiceName: ROS does not allow the name.
+            ContextShutdown: the node is down.
+        """
+
+    def make_request(self, srv_type: Any, request: Any) -> Any:
+        """Return a message of the request type, from a message, a mapping or None. Any thread.
+
+        Raises:
+            TypeError, ValueError: it does not fit.
+        """
+
+    def open_client(self, service: Service, deliver: Deliver) -> ClientPort:
+        """Create a client that passes its responses to ``deliver``.
+
+        Raises:
+            ContextShutdown: the node is down.
+            RosasyncError: the middleware refuses the client.
+            OSError: the process is out of file descriptors.
+        """
+
+    def open_service(self, service: Service, deliver: DeliverRequest) -> ServicePort:
+        """Create a service that passes its requests to ``deliver``; raises as `open_client`."""
+
+    def count_servers(self, service: Service) -> int:
+        """Return how many servers have the service's name, whatever their type and QoS. Cheap.
+
+        Raises:
+            ContextShutdown: the node is down.
+        """
+
+    def count_clients(self, service: Service) -> int:
+        """Return how many clients have the service's name, in all processes. Cheap.
+
+        Raises:
+            ContextShutdown: the node is down.
+        """
+
+    def find_servers(self, service: Service) -> Servers:
+        """Identify the servers that fit: by name, type and QoS.
+
+        If the middleware does not identify servers, the set has a placeholder for each server of
+        the name.
+
+        Raises:
+            ContextShutdown: the node is down.
+        """
+
+    def explain_missing(self, service: Service) -> str:
+        """Describe what the graph shows instead of this service, as a clause."""
+
+    def explain_mismatch(self, service: Service) -> str | None:
+        """Describe the servers of the name as a clause, if all of them have another type.
+
+        Raises:
+            ContextShutdown: the node is down.
+        """
+
+    def stop(self) -> None:
+        """Ask the executor thread to end. From any thread; idempotent; takes no lock."""
+
+    def join(self) -> bool:
+        """Wait for the executor thread to end and return whether it did; blocks."""
+
+    async def stopped(self) -> None:
+        """Wait, after `stop`, until `join` returns at once and `close` is safe."""
+
+    def close(self) -> None:
+        """Return what was borrowed and destroy what is owned; call `stop` and `join` first."""

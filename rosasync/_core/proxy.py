@@ -1,0 +1,332 @@
+"""AsyncServiceProxy: a tick-driven state machine for behaviour trees."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import enum
+import time
+from collections.abc import Mapping
+from copy import deepcopy
+from typing import TYPE_CHECKING, Any, Generic, cast
+
+from rosasync._core.aio import start_task
+from rosasync.errors import SessionClosed, UsageError
+from rosasync.options import check_timeout
+from rosasync.typing import RequestT, ResponseT, ServiceType, Timeout
+
+if TYPE_CHECKING:
+    from rclpy.qos import QoSProfile
+
+    from rosasync.session import Session
+
+__all__ = ["AsyncServiceProxy", "ProxyState"]
+
+
+class ProxyState(enum.Enum):
+    """The state of the last operation of an `AsyncServiceProxy`.
+
+    Attributes:
+        IDLE: there was no operation yet, or its response has been read.
+        WAITING: it waits for a server.
+        SERVICE_AVAILABLE: it waited for a server and found one.
+        RUNNING: a call is in progress: waiting for a server, a client or the response.
+        RESPONSE_READY: the response can be read.
+        TIMEOUT: the deadline of the call or the wait passed, in any phase.
+        ABORTED: it was stopped before it ended, or before its response was read.
+        ERROR: it failed with another error; `AsyncServiceProxy.get_errors` returns it.
+    """
+
+    IDLE = enum.auto()
+    WAITING = enum.auto()
+    SERVICE_AVAILABLE = enum.auto()
+    RUNNING = enum.auto()
+    RESPONSE_READY = enum.auto()
+    TIMEOUT = enum.auto()
+    ABORTED = enum.auto()
+    ERROR = enum.auto()
+
+
+PENDING = (ProxyState.WAITING, ProxyState.RUNNING)
+"""The states in which the loop works on the operation."""
+
+STOPPABLE = (*PENDING, ProxyState.RESPONSE_READY)
+"""The states that `AsyncServiceProxy.stop_call` ends."""
+
+
+class AsyncServiceProxy(Generic[RequestT, ResponseT]):
+    """Calls a service from the ticks of a behaviour tree.
+
+    No method blocks, and each may be called from the loop and from any other thread. A proxy owns
+    nothing: all proxies of a session share its clients through the pool.
+
+    ::
+
+        state              call_service  wait_for_service  stop_call  get_response
+        IDLE               RUNNING       WAITING           unchanged  None
+        WAITING            RUNNING       WAITING           ABORTED    None
+        SERVICE_AVAILABLE  RUNNING       WAITING           unchanged  None
+        RUNNING            RUNNING       WAITING           ABORTED    None
+        RESPONSE_READY     RUNNING       WAITING           ABORTED    response; IDLE
+        TIMEOUT            RUNNING       WAITING           unchanged  None
+        ABORTED            RUNNING       WAITING           unchanged  None
+        ERROR              RUNNING       WAITING           unchanged  None
+
+    Two states change by themselves: WAITING to SERVICE_AVAILABLE, TIMEOUT or ERROR, and RUNNING to
+    RESPONSE_READY, TIMEOUT or ERROR. When the session is closed, both become ERROR.
+
+    A new call or wait cancels and replaces the previous operation. A late response to that one is
+    counted, and never returned. ``shutdown`` does what ``stop_call`` does, and refuses new calls.
+
+    Args:
+        session: an open session.
+        srv_type: a service class or its name, ``"std_srvs/srv/SetBool"``.
+        srv_name: the service's name.
+        qos: a ``QoSProfile``; None for the service default.
+
+    Raises:
+        TypeError, ValueError: the service type does not exist, or the QoS is not a ``QoSProfile``.
+        InvalidServiceName: ROS does not allow the name.
+        UsageError: the session is not open yet.
+        SessionClosed: the session is closed.
+    """
+
+    # `_operation` is the current operation. Any thread replaces it as a whole, and the loop writes
+    # only into the operation that it works on, `_working`. So no lock is needed, and the result of
+    # a replaced call is never visible. After each replacement the loop reconciles the two. Posts
+    # may be reordered between threads, but the last reconciliation sees the last operation.
+    __slots__ = (
+        "__weakref__",
+        "_arguments",
+        "_closed",
+        "_gateway",
+        "_operation",
+        "_pool",
+        "_service",
+        "_timeout",
+        "_working",
+    )
+
+    def __init__(
+        self,
+        session: Session,
+        srv_type: ServiceType[RequestT, ResponseT] | str,
+        srv_name: str,
+        *,
+        qos: QoSProfile | None = None,
+    ) -> None:
+        core = session.core
+        core.gateway.check_open()
+        self._gateway = core.gateway
+        self._pool = core.pool
+        self._arguments = core.arguments
+        self._timeout = core.timeout
+        self._service = core.arguments.service(srv_type, srv_name, qos)
+        self._operation = _Operation(ProxyState.IDLE)
+        self._working: _Operation | None = None
+        self._closed = False
+
+    def __repr__(self) -> str:
+        return f"<AsyncServiceProxy {self._service.key.srv_name} {self.get_state().name}>"
+
+    def call_service(
+        self,
+        request: RequestT | Mapping[str, Any] | None = None,
+        timeout: Timeout = ...,
+        *,
+        wait: bool = True,
+    ) -> None:
+        """Start a call, which replaces the previous operation. The state becomes RUNNING.
+
+        On the loop's thread, if a client is free, the request is sent before this returns.
+        Otherwise it is copied. So it may be changed afterwards.
+
+        Args:
+            request: a message, a mapping of its fields, or None for an empty one.
+            timeout: seconds for the whole call; None for no deadline; if left out, the session's.
+            wait: False to fail at once if there is no server.
+
+        Raises:
+            TypeError, ValueError: an argument does not fit; the state is unchanged.
+            UsageError: the proxy was shut down.
+        """
+        message, seconds = self._arguments.call(
+            self._service, request, timeout, self._timeout, wait
+        )
+        if request is not None and not self._gateway.on_loop:
+            message = deepcopy(message)
+        self._start(_Operation(ProxyState.RUNNING, message, seconds, wait))
+
+    def make_request(self, request: RequestT | Mapping[str, Any] | None) -> RequestT:
+        """Return the message that `call_service` sends for this argument, to prepare it in advance.
+
+        Raises:
+            TypeError, ValueError: it does not fit.
+        """
+        message, _ = self._arguments.call(self._service, request, None, None)
+        return cast(RequestT, message)
+
+    def wait_for_service(self, timeout: Timeout = None) -> None:
+        """Wait for a server, which replaces the previous operation. The state becomes WAITING.
+
+        Args:
+            timeout: seconds; None, or left out, for no deadline; ``...`` for the session's.
+
+        Raises:
+            TypeError, ValueError: the timeout does not fit; the state is unchanged.
+            UsageError: the proxy was shut down.
+        """
+        seconds = check_timeout(timeout, self._timeout)
+        self._start(_Operation(ProxyState.WAITING, timeout=seconds))
+
+    def stop_call(self) -> None:
+        """Stop the operation, in any state.
+
+        A call or wait in progress is cancelled, an unread response is dropped, and the state
+        becomes ABORTED. In the other states nothing changes.
+        """
+        if self._operation.state in STOPPABLE:
+            self._replace(_Operation(ProxyState.ABORTED))
+
+    def get_state(self) -> ProxyState:
+        """Return the state. Cheap: it only reads an attribute."""
+        return self._operation.state
+
+    def get_response(self) -> ResponseT | None:
+        """Return the response and become IDLE; return None if there is no unread response."""
+        operation = self._operation
+        if operation.state is not ProxyState.RESPONSE_READY:
+            return None
+        # The loop does not write into a finished operation, so this thread may.
+        operation.state = ProxyState.IDLE
+        response, operation.response = operation.response, None
+        return cast(ResponseT, response)
+
+    def get_errors(self) -> list[Exception]:
+        """Return the error in the states TIMEOUT and ERROR; otherwise an empty list."""
+        error = self._operation.error
+        return [] if error is None else [error]
+
+    def shutdown(self) -> None:
+        """Stop the call, and refuse further ones; idempotent."""
+        self._closed = True
+        self.stop_call()
+
+    def _start(self, operation: _Operation) -> None:
+        if self._closed:
+            raise UsageError(
+                f"{self._service.key.srv_name}: the proxy was shut down: create a new one"
+            )
+        self._replace(operation)
+        if self._closed:
+            # Another thread has shut the proxy down since the check.
+            self.stop_call()
+
+    def _replace(self, operation: _Operation) -> None:
+        before, self._operation = self._operation, operation
+        gateway = self._gateway
+        gateway.discard(before)
+        if operation.state not in PENDING:
+            with contextlib.suppress(SessionClosed):
+                gateway.call(self._reconcile)
+            return
+        gateway.register(operation)
+        try:
+            gateway.call(self._reconcile)
+        except SessionClosed as error:
+            gateway.discard(operation)
+            operation.fail(error)
+
+    # On the loop's thread.
+
+    def _reconcile(self) -> None:
+        """Cancel the work on a replaced operation, and start the work on the current one."""
+        operation, working = self._operation, self._working
+        if operation is working:
+            return
+        if working is not None and working.task is not None:
+            working.task.cancel()
+        self._working = None
+        if operation.state in PENDING and not operation.begun:
+            operation.begun = True
+            self._working = operation
+            loop, work = self._gateway.loop, self._work(operation)
+            # A call is sent in the same tick. A wait has to be visible as WAITING first.
+            calls = operation.state is ProxyState.RUNNING
+            operation.task = start_task(loop, work) if calls else loop.create_task(work)
+
+    async def _work(self, operation: _Operation) -> None:
+        try:
+            operation.end(*await self._perform(operation))
+        except TimeoutError as error:
+            operation.end(ProxyState.TIMEOUT, error=error)
+        except asyncio.CancelledError:
+            operation.end(ProxyState.ABORTED)
+            raise
+        except Exception as error:
+            operation.fail(error)
+        finally:
+            self._gateway.discard(operation)
+            if self._working is operation:
+                self._working = None
+
+    async def _perform(self, operation: _Operation) -> tuple[ProxyState, Any]:
+        service = self._pool.service_of(self._service)
+        if operation.state is ProxyState.WAITING:
+            await service.wait_for_server(operation.time_left())
+            return ProxyState.SERVICE_AVAILABLE, None
+        response = await service.call(
+            operation.request, operation.time_left(), operation.wait, copy=True
+        )
+        return ProxyState.RESPONSE_READY, response
+
+
+class _Operation:
+    """One operation of a proxy: a call, a wait, or none."""
+
+    __slots__ = (
+        "begun",
+        "error",
+        "request",
+        "response",
+        "started",
+        "state",
+        "task",
+        "timeout",
+        "wait",
+    )
+
+    def __init__(
+        self,
+        state: ProxyState,
+        request: Any = None,
+        timeout: float | None = None,
+        wait: bool = True,
+    ) -> None:
+        self.state = state
+        self.request = request
+        self.timeout = timeout
+        self.wait = wait
+        self.started = time.monotonic()
+        self.begun = False
+        self.response: Any = None
+        self.error: Exception | None = None
+        self.task: asyncio.Task[None] | None = None
+
+    def time_left(self) -> float | None:
+        """Return the seconds that are left of the timeout."""
+        if self.timeout is None:
+            return None
+        return max(0.0, self.timeout - (time.monotonic() - self.started))
+
+    def end(self, state: ProxyState, response: Any = None, error: Exception | None = None) -> None:
+        """Set the outcome, unless there is one."""
+        if self.state in PENDING:
+            self.response = response
+            self.error = error
+            # Last, because other threads read it first.
+            self.state = state
+
+    def fail(self, error: Exception) -> None:
+        """End with an error, unless it has ended already."""
+        self.end(ProxyState.ERROR, error=error)

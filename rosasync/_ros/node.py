@@ -1,0 +1,387 @@
+"""RosNode: a node, created or borrowed, with its executor thread, its bridge and its graph."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import Callable, Hashable
+from typing import TYPE_CHECKING, Any
+
+import rclpy
+from rclpy.context import Context
+from rclpy.exceptions import InvalidHandle, InvalidNodeNameException
+from rclpy.executors import Executor
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, qos_profile_system_default
+from rclpy.service_introspection import ServiceIntrospectionState
+from rclpy.signals import SignalHandlerOptions
+
+from rosasync._core.gateway import LoopGateway
+from rosasync._core.ports import ClientPort, Deliver, DeliverRequest, Service, ServicePort
+from rosasync._ros import discovery, names, profile, rcl
+from rosasync._ros.direct_bridge import DirectBridge
+from rosasync._ros.executor_bridge import ExecutorBridge
+from rosasync._ros.executor_thread import ExecutorThread, ThreadUser, executor_thread_of
+from rosasync._ros.failures import RclpyError, check_up, is_up, refusal
+from rosasync._ros.graph import GraphQueries, GraphWaitable
+from rosasync._ros.messages import request_message
+from rosasync._ros.shared_memory import check_ports
+from rosasync.errors import RosasyncError, UsageError
+from rosasync.options import SessionOptions
+
+if TYPE_CHECKING:
+    from rosasync._core.ports import NodePort
+
+__all__ = ["RosNode"]
+
+logger = logging.getLogger("rosasync")
+
+DIRECT_TRIED = ("rmw_fastrtps_cpp", "rmw_fastrtps_dynamic_cpp")
+"""The middlewares for which ``bridge="auto"`` chooses the direct bridge."""
+
+JOIN_TIMEOUT = 5.0
+"""Seconds to wait for the executor thread to finish its current callback."""
+
+LEAVE_TIMEOUT = 0.2
+"""Maximum number of seconds to wait for a user's executor to begin its next turn."""
+
+CALLBACK_RAISED = "a callback of the node raised an exception; the session goes on"
+
+Bridge = DirectBridge | ExecutorBridge
+
+
+class RosNode:
+    """The part of a session that uses rclpy: a `rosasync._core.ports.NodePort`.
+
+    Created, used and closed on the loop's thread.
+
+    Args:
+        options: the session's.
+        gateway: the way into the loop.
+        on_graph: called on the loop's thread after a change of the graph.
+        on_shutdown: called on the loop's thread when the context is shut down.
+
+    Raises:
+        TypeError, ValueError: the node is neither a node nor a valid name.
+        UsageError: the context is down, or the bridge cannot be used here.
+        ContextShutdown: the node that was passed in is down.
+        RosasyncError: the node or the context cannot be created.
+    """
+
+    def __init__(
+        self,
+        options: SessionOptions,
+        gateway: LoopGateway,
+        on_graph: Callable[[], None],
+        on_shutdown: Callable[[], None],
+    ) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._gateway = gateway
+        self._on_graph = on_graph
+        self._on_shutdown = on_shutdown
+        self._introspection = options.introspection
+        self._in_flight = options.limits.in_flight
+        self._graph_pending = False
+        self._left = asyncio.Event()
+        self._user = ThreadUser(self._post_error, self._post_shutdown, self._post_left)
+        self._thread: ExecutorThread | None = None
+        self._own_context: Context | None = None
+        self._own_node: Node | None = None
+        self._user_executor: Executor | None = None
+        self._waitable: GraphWaitable | None = None
+        self._bridge: Bridge | None = None
+        try:
+            self._open(options)
+        except BaseException:
+            self.stop()
+            self.join()
+            self.close()
+            raise
+
+    @property
+    def node(self) -> Node:
+        """The ``rclpy.node.Node``."""
+        return self._node
+
+    @property
+    def name(self) -> str:
+        """The node's name, also after its destruction."""
+        return self._name
+
+    @property
+    def bridge(self) -> str:
+        """The bridge in use: ``"direct"`` or ``"executor"``."""
+        return self._opened.name
+
+    @property
+    def graph_events(self) -> bool:
+        """Whether the node reports changes of the graph."""
+        return self._waitable is not None
+
+    @property
+    def executor_thread(self) -> int | None:
+        """The identifier of the executor thread, if a session started it."""
+        return None if self._thread is None else self._thread.ident
+
+    def ok(self) -> bool:
+        """Return whether the node and its context are up."""
+        return is_up(self._node)
+
+    def describe(self, srv_type: Any, srv_name: str, qos: Any) -> Service:
+        """Check and resolve a service."""
+        return names.describe(self._node, srv_type, srv_name, qos)
+
+    def make_request(self, srv_type: Any, request: Any) -> Any:
+        """Return a message of the request type."""
+        return request_message(srv_type, request)
+
+    def open_client(self, service: Service, deliver: Deliver) -> ClientPort:
+        """Create a client that passes its responses to ``deliver``."""
+        try:
+            return self._opened.open_client(
+                service.srv_type, service.srv_name, _qos_of(service, self._client_depth()), deliver
+            )
+        except RclpyError as error:
+            raise refusal(self._node, service, "client", error) from error
+
+    def open_service(self, service: Service, deliver: DeliverRequest) -> ServicePort:
+        """Create a service that passes its requests to ``deliver``."""
+        try:
+            return self._opened.open_service(
+                service.srv_type,
+                service.srv_name,
+                _qos_of(service, names.DEPTH),
+                deliver,
+            )
+        except RclpyError as error:
+            raise refusal(self._node, service, "service", error) from error
+
+    def count_servers(self, service: Service) -> int:
+        """Return how many servers have the name, whatever their type."""
+        return self._graph.count_servers(service)
+
+    def count_clients(self, service: Service) -> int:
+        """Return how many clients have the name, in all processes."""
+        return self._graph.count_clients(service)
+
+    def find_servers(self, service: Service) -> frozenset[Hashable]:
+        """Identify the servers that fit: by name, type and QoS."""
+        return self._graph.find_servers(service)
+
+    def explain_missing(self, service: Service) -> str:
+        """Describe what the graph shows instead of this service, as a clause."""
+        return self._graph.explain_missing(service)
+
+    def explain_mismatch(self, service: Service) -> str | None:
+        """Describe the servers of the name as a clause, if all of them have another type."""
+        return self._graph.explain_mismatch(service)
+
+    def stop(self) -> None:
+        """Ask the executor thread to end. From any thread; idempotent; takes no lock.
+
+        It ends with the last session that uses it.
+        """
+        if self._thread is not None:
+            self._thread.leave(self._user)
+
+    def join(self) -> bool:
+        """Wait for the executor thread to end and return whether it did; blocks."""
+        return self._thread is None or self._thread.join(self._user, JOIN_TIMEOUT)
+
+    async def stopped(self) -> None:
+        """Wait, after `stop`, until `join` returns at once and `close` is safe."""
+        if self._thread is not None:
+            await self._left.wait()
+        if self._user_executor is not None and self._own_node is not None:
+            await _leave(self._user_executor, self._own_node)
+        await asyncio.sleep(self._opened.destroy_delay)
+
+    def close(self) -> None:
+        """Return what was borrowed and destroy what is owned; call `stop` and `join` first."""
+        if self._waitable is not None:
+            self._waitable.close()
+        if self._bridge is not None:
+            self._bridge.close()
+        if self._thread is not None:
+            self._thread.close()
+        # Drop the reference: a MultiThreadedExecutor ends its threads when it is collected.
+        executor, self._user_executor = self._user_executor, None
+        if executor is not None and self._node.executor is executor:
+            self._node.executor = None
+        if self._own_node is not None:
+            self._own_node.destroy_node()
+        if self._own_context is not None:
+            self._own_context.try_shutdown()
+
+    # Opening.
+
+    def _open(self, options: SessionOptions) -> None:
+        self._node = self._make_node(options)
+        check_up(self._node)
+        self._name = str(self._node.get_name())
+        executor = options.executor
+        librcl = rcl.load()
+        if _takes_callbacks(executor or self._node.executor):
+            librcl = None
+        self._bridge = self._make_bridge(options, librcl)
+        self._graph = GraphQueries(self._node, events=librcl is not None)
+        if librcl is not None:
+            self._waitable = GraphWaitable(self._node, librcl, self._post_graph)
+        self._node.context.on_shutdown(self._post_shutdown)
+        # Last: a failure before this destroys the node, which no executor may spin then.
+        if executor is not None and executor.add_node(self._node):
+            self._user_executor = executor
+        self._thread = executor_thread_of(self._node, self._user)
+
+    def _make_node(self, options: SessionOptions) -> Node:
+        node = options.node
+        if isinstance(node, Node):
+            return node
+        if not isinstance(node, str):
+            kind = type(node).__name__
+            raise TypeError(f"node must be a name or an rclpy.node.Node, not {kind}")
+        context = options.context
+        if context is not None and not context.ok():
+            raise UsageError(
+                "the context is not initialised, or was shut down: call "
+                "rclpy.init(context=context) first, or leave it out"
+            )
+        try:
+            self._own_node = self._make_own(node, context)
+        except InvalidNodeNameException as error:
+            reason = str(error).strip().replace("\n", " ")
+            raise ValueError(f"{node!r} is not a valid node name: {reason}") from None
+        except RuntimeError as error:
+            # RCLError, or what C++ throws if the process is out of file descriptors.
+            raise RosasyncError(f"rclpy cannot create the node {node!r}: {error}") from error
+        return self._own_node
+
+    def _make_own(self, name: str, given: Context | None) -> Node:
+        """Make a node, and a context for it unless one is given."""
+        context = given
+        if context is None:
+            context = self._own_context = Context()
+            rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
+        if "fastrtps" not in rclpy.get_rmw_implementation_identifier():
+            return Node(name, context=context)
+        domain = context.get_domain_id()
+        has_participant = bool(discovery.own_ports(domain))
+        if given is None or not has_participant:
+            check_ports(domain)
+        if given is not None:
+            return Node(name, context=context)
+        # The first node of a context makes its participant. Fast DDS reads its profiles when a
+        # process makes its first participant.
+        with profile.applied(first=not has_participant), _introduced(domain):
+            return Node(name, context=context)
+
+    def _make_bridge(self, options: SessionOptions, librcl: rcl.Rcl | None) -> Bridge:
+        tried = rclpy.get_rmw_implementation_identifier() in DIRECT_TRIED
+        if options.bridge == "direct" and librcl is None:
+            raise UsageError(
+                "bridge='direct' does not work here: either an EventsExecutor spins the node and "
+                "takes the responses, or this platform does not support it; use bridge='auto'"
+            )
+        if (
+            librcl is None
+            or options.bridge == "executor"
+            or (options.bridge == "auto" and not tried)
+        ):
+            if options.busy_poll:
+                raise UsageError(
+                    "busy_poll needs the direct bridge, which is not in use here: leave it out, "
+                    "or see `rosasync doctor` for the reason"
+                )
+            return ExecutorBridge(self._node, self._gateway, self._introspect)
+        return DirectBridge(self._node, librcl, self._loop, self._introspect, options.busy_poll)
+
+    def _client_depth(self) -> int:
+        if profile.heartbeats():
+            return names.DEPTH
+        return max(names.DEPTH_WITHOUT_HEARTBEATS, self._in_flight)
+
+    def _introspect(self, entity: Any) -> None:
+        """Make a client or service publish its calls, as ``introspection`` says."""
+        if self._introspection != "off":
+            state = getattr(ServiceIntrospectionState, self._introspection.upper())
+            clock = self._node.get_clock()
+            entity.configure_introspection(clock, qos_profile_system_default, state)
+
+    @property
+    def _opened(self) -> Bridge:
+        assert self._bridge is not None
+        return self._bridge
+
+    # Called on the executor's thread, or on the one that shuts the context down.
+
+    def _post_graph(self) -> None:
+        self._graph.changed()
+        if not self._graph_pending:
+            self._graph_pending = True
+            self._gateway.post_if_open(self._report_graph)
+
+    def _report_graph(self) -> None:
+        self._graph_pending = False
+        self._on_graph()
+
+    def _post_shutdown(self) -> None:
+        self._gateway.post_if_open(self._report_shutdown)
+
+    def _report_shutdown(self) -> None:
+        self._opened.refuse()
+        self._on_shutdown()
+
+    def _post_left(self) -> None:
+        with contextlib.suppress(RuntimeError):
+            self._loop.call_soon_threadsafe(self._left.set)
+
+    def _post_error(self, error: Exception) -> None:
+        context = {"message": CALLBACK_RAISED, "exception": error}
+        if self._gateway.closed:
+            logger.error(CALLBACK_RAISED, exc_info=error)
+        else:
+            self._gateway.post_if_open(self._loop.call_exception_handler, context)
+
+
+async def _leave(executor: Executor, node: Node) -> None:
+    """Remove the session's node from a user's executor, so that it can be destroyed safely.
+
+    If entities are destroyed while an executor adds them to its wait set, its ``spin`` raises
+    `InvalidHandle` (rclpy issue 1355). So wait until the executor has begun another turn, but only
+    for `LEAVE_TIMEOUT`, because nothing may be spinning it.
+    """
+    loop = asyncio.get_running_loop()
+    turn = asyncio.Event()
+
+    def report() -> None:
+        # The executor may run this after the loop was closed.
+        with contextlib.suppress(RuntimeError):
+            loop.call_soon_threadsafe(turn.set)
+
+    executor.remove_node(node)
+    # AttributeError: an executor of Jazzy that was shut down has no guard condition to trigger.
+    with contextlib.suppress(AttributeError, InvalidHandle, RuntimeError, TimeoutError):
+        # Two tasks: the turn that runs the first may have listed its nodes before the removal.
+        executor.create_task(executor.create_task, report)
+        async with asyncio.timeout(LEAVE_TIMEOUT):
+            await turn.wait()
+
+
+def _introduced(domain: int) -> contextlib.AbstractContextManager[None]:
+    return contextlib.nullcontext() if profile.switched_off() else discovery.introduced(domain)
+
+
+def _qos_of(service: Service, depth: int) -> QoSProfile:
+    return service.qos or names.default_qos(depth)
+
+
+def _takes_callbacks(executor: Executor | None) -> bool:
+    """Return whether this executor sets the middleware's callbacks itself, like EventsExecutor."""
+    return any(kind.__name__ == "EventsExecutor" for kind in type(executor).__mro__)
+
+
+if TYPE_CHECKING:
+
+    def _fits(node: RosNode) -> NodePort:
+        return node

@@ -1,0 +1,1 @@
+"""Everything between a request that was taken and its response."""

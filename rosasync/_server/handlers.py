@@ -1,0 +1,463 @@
+"""The handlers of a server: their kinds, how they and the hooks run, and their tasks."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import inspect
+import logging
+from collections.abc import Awaitable, Callable, Coroutine, Generator
+from contextvars import Context, ContextVar
+from dataclasses import dataclass
+from time import monotonic
+from types import CoroutineType
+from typing import Any, Generic, TypeAlias, TypeVar
+
+from rosasync._server.service_call import CallCounts, ResponseSender, ServiceCall
+from rosasync.errors import ContextShutdown, SessionClosed
+from rosasync.typing import RequestT, ResponseT
+
+__all__ = [
+    "ErrorHook",
+    "Handler",
+    "HandlerKind",
+    "HandlerRunner",
+    "HandlerTasks",
+    "OverloadHook",
+    "check_hook",
+    "settle_kind",
+]
+
+Handler: TypeAlias = (
+    Callable[[RequestT, ResponseT], ResponseT | Awaitable[ResponseT]]
+    | Callable[
+        [ServiceCall[RequestT, ResponseT]],
+        ResponseT | Awaitable[ResponseT | None] | None,
+    ]
+)
+"""``handler(request, response)`` or ``handler(call)``, plain or async."""
+
+ErrorHook: TypeAlias = Callable[
+    [ServiceCall[RequestT, ResponseT], Exception],
+    ResponseT | Awaitable[ResponseT | None] | None,
+]
+"""``on_error(call, error)``, plain or async."""
+
+OverloadHook: TypeAlias = Callable[
+    [ServiceCall[RequestT, ResponseT]],
+    ResponseT | Awaitable[ResponseT | None] | None,
+]
+"""``on_overload(call)``, plain or async."""
+
+logger = logging.getLogger("rosasync")
+
+BLOCKING = 0.1
+"""Seconds for which a handler may block the loop unreported. asyncio's debug mode has the same."""
+
+_handler_task: ContextVar[asyncio.Task[Any] | None] = ContextVar("handler_task", default=None)
+"""The task of the handler, or hook, in whose context the code runs. Tasks that a handler starts
+inherit it."""
+
+
+class HandlerTasks:
+    """The tasks of a server's handlers, which its end waits for. Confined to the loop's thread.
+
+    A handler that waits for the end itself, by closing its server or its session, is neither waited
+    for nor cancelled: it would deadlock.
+    """
+
+    def __init__(self) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._closers: set[asyncio.Task[Any]] = set()
+        # Wakes `wait` when `_closers` grows, because it must not wait for a closer.
+        self._closer_added: asyncio.Future[None] | None = None
+
+    def __len__(self) -> int:
+        return len(self._pending())
+
+    def spawn(self, work: Coroutine[Any, Any, None], context: Context | None = None) -> None:
+        """Run a coroutine in a task, in a copy of this context, or of the current one."""
+        # Not with the argument `context`, because not every task factory takes it.
+        create = self._loop.create_task
+        task = create(self._run(work)) if context is None else context.run(create, self._run(work))
+        if not task.done():
+            self._tasks.add(task)
+
+    def exclude_caller(self) -> None:
+        """Do not wait for the handler whose task calls this, or started the task that does."""
+        task = _handler_task.get()
+        if task in self._tasks:
+            self._closers.add(task)
+            if self._closer_added is not None and not self._closer_added.done():
+                self._closer_added.set_result(None)
+
+    async def wait(self, deadline: float | None) -> None:
+        """Wait until every task is done, or until ``deadline`` in loop time (None: no deadline)."""
+        while tasks := self._pending():
+            left = None if deadline is None else deadline - self._loop.time()
+            if left is not None and left <= 0:
+                return
+            self._closer_added = self._loop.create_future()
+            await asyncio.wait(
+                {*tasks, self._closer_added},
+                timeout=left,
+                return_when=asyncio.FIRST_COMPLETED,
+            )
+
+    def cancel(self) -> None:
+        """Cancel every task, in the next turn."""
+        for task in self._pending():
+            # Not at once: a task that has not begun would end without running its handler's
+            # `finally`, or ours.
+            self._loop.call_soon(task.cancel)
+
+    def _pending(self) -> set[asyncio.Task[None]]:
+        # A task that other code cancels before it begins never removes itself from the set.
+        return {task for task in self._tasks - self._closers if not task.done()}
+
+    async def _run(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.current_task()
+        assert task is not None
+        # `spawn` is too late for this if the task starts eagerly.
+        self._tasks.add(task)
+        _handler_task.set(task)
+        try:
+            await work
+        except (KeyboardInterrupt, SystemExit):
+            # The loop raises it. Retrieve it, so that the task does not log it as well.
+            task.add_done_callback(asyncio.Task.exception)
+            raise
+        finally:
+            # Otherwise the task and its context keep each other alive.
+            _handler_task.set(None)
+            self._tasks.discard(task)
+            self._closers.discard(task)
+
+
+@dataclass(frozen=True, slots=True)
+class HandlerKind(Generic[RequestT, ResponseT]):
+    """How to run a handler.
+
+    Attributes:
+        invoke: calls the handler with the arguments that it takes.
+        may_defer: whether it may return None, to respond later.
+        name: its name, for the log.
+    """
+
+    invoke: Callable[[ServiceCall[RequestT, ResponseT]], Any]
+    may_defer: bool
+    name: str
+
+
+class HandlerRunner(Generic[RequestT, ResponseT]):
+    """Runs the handler and the hooks of a server, and settles their calls.
+
+    Confined to the loop's thread. Exceptions of handlers and hooks do not leave it, except those
+    that end the program, such as KeyboardInterrupt.
+
+    Args:
+        kind: how to run the handler; None if the calls are iterated over.
+        on_error: the hook for handlers that failed.
+        sender: sends the responses.
+        counts: counts the handlers that defer or fail.
+        tasks: runs the async handlers.
+        on_finished: called when an async handler has finished.
+
+    Attributes:
+        running: how many handlers run.
+    """
+
+    def __init__(
+        self,
+        kind: HandlerKind[RequestT, ResponseT] | None,
+        on_error: ErrorHook[RequestT, ResponseT] | None,
+        sender: ResponseSender[ResponseT],
+        counts: CallCounts,
+        tasks: HandlerTasks,
+        on_finished: Callable[[], None],
+    ) -> None:
+        self.running = 0
+        self._kind = kind
+        self._on_error = on_error
+        self._sender = sender
+        self._counts = counts
+        self._tasks = tasks
+        self._on_finished = on_finished
+        # Whether a handler has blocked the loop: it is reported once.
+        self._blocked = False
+
+    def start(self, call: ServiceCall[RequestT, ResponseT]) -> None:
+        """Run the handler: a plain one to its end, an async one in a task."""
+        trace = call.trace
+        if trace is not None:
+            trace.enter("handling")
+        context = None if trace is None else trace.context
+        self.running += 1
+        in_task = False
+        try:
+            result = self._invoke(call, context)
+            # The response first, because `isawaitable` is slow.
+            if isinstance(result, self._sender.response_type) or not inspect.isawaitable(result):
+                self._finish(call, result)
+            else:
+                in_task = True
+                self._tasks.spawn(self._await_handler(call, self._timed(result)), context)
+        except BaseException as error:
+            self._contain(call, error, self._fail)
+        finally:
+            if not in_task:
+                self.running -= 1
+
+    def call_hook(
+        self,
+        call: ServiceCall[RequestT, ResponseT],
+        hook: Callable[..., Any],
+        arguments: tuple[Any, ...],
+        otherwise: Callable[[ServiceCall[RequestT, ResponseT]], None],
+    ) -> None:
+        """Send the response that a hook returns, plain or async.
+
+        Args:
+            call: the call to answer.
+            hook: the hook.
+            arguments: what it is called with.
+            otherwise: called with the call if the hook has failed or returned None.
+        """
+        try:
+            result = hook(*arguments)
+            if result is not None and inspect.isawaitable(result):
+                self._tasks.spawn(self._await_hook(call, result, otherwise))
+                return
+            if result is not None:
+                call.respond(result)
+        except BaseException as error:
+            self._contain(call, error, self._fail_hook)
+        if not call.settled:
+            otherwise(call)
+
+    def _invoke(self, call: ServiceCall[RequestT, ResponseT], context: Context | None) -> Any:
+        """Call the handler, in a context if there is one, and report it if it blocks the loop."""
+        assert self._kind is not None
+        invoke = self._kind.invoke
+        began = monotonic()
+        try:
+            return invoke(call) if context is None else context.run(invoke, call)
+        finally:
+            if monotonic() - began > BLOCKING:
+                self._report_blocking(monotonic() - began)
+
+    def _timed(self, pending: Awaitable[Any]) -> Awaitable[Any]:
+        """Return what awaits a handler, and reports it if one of its steps blocks the loop."""
+        if type(pending) is CoroutineType and not self._blocked:
+            return _TimedSteps(pending, self._report_blocking)
+        return pending
+
+    def _cancelled(self, call: ServiceCall[RequestT, ResponseT]) -> None:
+        """Give up a call whose handler, or hook, was cancelled."""
+        call.give_up("given up: its handler was cancelled")
+        if not call.responded:
+            logger.warning(
+                "%s: the handler of %r was cancelled, so its client gets no response",
+                self._sender.name,
+                call,
+            )
+
+    async def _await_handler(
+        self, call: ServiceCall[RequestT, ResponseT], pending: Awaitable[Any]
+    ) -> None:
+        try:
+            self._finish(call, await pending)
+        except BaseException as error:
+            self._contain(call, error, self._fail)
+        finally:
+            self.running -= 1
+            self._on_finished()
+
+    async def _await_hook(
+        self,
+        call: ServiceCall[RequestT, ResponseT],
+        pending: Awaitable[Any],
+        otherwise: Callable[[ServiceCall[RequestT, ResponseT]], None],
+    ) -> None:
+        try:
+            result = await pending
+            if result is not None:
+                call.respond(result)
+        except BaseException as error:
+            self._contain(call, error, self._fail_hook)
+        if not call.settled:
+            otherwise(call)
+
+    def _finish(self, call: ServiceCall[RequestT, ResponseT], result: Any) -> None:
+        assert self._kind is not None
+        if result is not None:
+            call.respond(result)
+        elif not self._kind.may_defer:
+            raise TypeError(
+                "the handler returned None instead of the response: end it with `return response`; "
+                "to respond later, take one argument, `call`, and use call.respond(response)"
+            )
+        elif not call.settled:
+            self._counts.deferred += 1
+            if call.trace is not None:
+                call.trace.enter("deferred")
+
+    def _contain(
+        self,
+        call: ServiceCall[RequestT, ResponseT],
+        error: BaseException,
+        fail: Callable[[ServiceCall[RequestT, ResponseT], Exception], None],
+    ) -> None:
+        """Settle a call whose handler, or hook, has raised; pass on what ends the program."""
+        if call.trace is not None:
+            call.trace.fail(error)
+        if isinstance(error, asyncio.CancelledError):
+            self._cancelled(call)
+        elif isinstance(error, Exception):
+            fail(call, error)
+        else:
+            raise error
+
+    def _fail(self, call: ServiceCall[RequestT, ResponseT], error: Exception) -> None:
+        if self._sender.ending is not None and isinstance(error, SessionClosed | ContextShutdown):
+            logger.warning(
+                "%s: the handler of %r outlasted the server, so its client gets no response",
+                self._sender.name,
+                call,
+            )
+            return
+        self._counts.failed += 1
+        logger.error(
+            "%s: the handler of %r raised an exception%s",
+            self._sender.name,
+            call,
+            "" if self._on_error or call.settled else ", so its client gets no response",
+            exc_info=error,
+        )
+        if self._on_error is None or call.settled:
+            self._give_up(call)
+        else:
+            self.call_hook(call, self._on_error, (call, error), self._give_up)
+
+    def _give_up(self, call: ServiceCall[RequestT, ResponseT]) -> None:
+        call.give_up("given up: its handler failed", failed=True)
+
+    def _report_blocking(self, seconds: float) -> None:
+        if self._blocked or self._kind is None:
+            return
+        self._blocked = True
+        logger.warning(
+            "%s: the handler %s has blocked the event loop for %.0f ms, in which nothing else ran: "
+            "do slow work in `await asyncio.to_thread(…)`. This is reported once for each server",
+            self._sender.name,
+            self._kind.name,
+            seconds * 1000,
+        )
+
+    def _fail_hook(self, call: ServiceCall[RequestT, ResponseT], error: Exception) -> None:
+        logger.error(
+            "%s: on_error or on_overload raised an exception for %r",
+            self._sender.name,
+            call,
+            exc_info=error,
+        )
+
+
+class _TimedSteps:
+    """Awaits a coroutine, and reports each of its steps that blocks the loop for too long.
+
+    A step is what runs from one suspension to the next, so the time that an ``await`` takes does
+    not count.
+    """
+
+    __slots__ = ("_coroutine", "_report")
+
+    def __init__(
+        self, coroutine: Coroutine[Any, Any, Any], report: Callable[[float], None]
+    ) -> None:
+        self._coroutine = coroutine
+        self._report = report
+
+    def __await__(self) -> Generator[Any, Any, Any]:
+        coroutine = self._coroutine
+        step: Callable[[Any], Any] = coroutine.send
+        value: Any = None
+        while True:
+            began = monotonic()
+            try:
+                awaited = step(value)
+            except StopIteration as end:
+                return end.value
+            finally:
+                value = None  # An exception would refer to this frame, and the frame to it.
+                if monotonic() - began > BLOCKING:
+                    self._report(monotonic() - began)
+            try:
+                value = yield awaited
+                step = coroutine.send
+            except GeneratorExit:
+                coroutine.close()
+                raise
+            except BaseException as error:
+                step, value = coroutine.throw, error
+
+
+def settle_kind(
+    handler: Handler[RequestT, ResponseT] | None,
+) -> HandlerKind[RequestT, ResponseT] | None:
+    """Decide how to run a handler, by the number of its required arguments.
+
+    Raises:
+        TypeError: it takes neither a call nor request and response.
+    """
+    if handler is None:
+        return None
+    if inspect.isclass(handler):
+        raise TypeError(
+            f"a handler is a function or a coroutine function, not the class {handler!r}"
+        )
+    if not callable(handler):
+        raise TypeError(f"a handler must be callable, not {type(handler).__name__}")
+    code: Any = handler
+    while isinstance(code, functools.partial):
+        code = code.func
+    for function in (code, type(code).__call__):
+        if inspect.isgeneratorfunction(function) or inspect.isasyncgenfunction(function):
+            raise TypeError(f"a handler returns its response, it does not yield: {handler!r}")
+    invoke: Callable[..., Any] = handler
+    name = getattr(code, "__qualname__", type(code).__qualname__)
+    match _count_required(handler):
+        case 1:
+            return HandlerKind(invoke, may_defer=True, name=name)
+        case 2:
+            return HandlerKind(
+                lambda call: invoke(call.request, call.response), may_defer=False, name=name
+            )
+    raise TypeError(f"a handler takes (call) or (request, response): {handler!r} does not")
+
+
+HookT = TypeVar("HookT")
+
+
+def check_hook(name: str, hook: HookT) -> HookT:
+    """Return a hook, or None.
+
+    Raises:
+        TypeError: it is not callable.
+    """
+    if hook is not None and not callable(hook):
+        raise TypeError(f"{name} must be callable, not {type(hook).__name__}")
+    return hook
+
+
+def _count_required(handler: Callable[..., Any]) -> int | None:
+    """Return the number of required positional arguments; None if it needs others too."""
+    try:
+        parameters = inspect.signature(handler).parameters.values()
+    except ValueError:
+        return None
+    required = [p for p in parameters if p.default is p.empty]
+    if any(p.kind is p.KEYWORD_ONLY for p in required):
+        return None
+    return sum(p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD) for p in required)

@@ -1,0 +1,494 @@
+"""ServiceServer: takes requests, limits how many run and wait, and ends."""
+
+from __future__ import annotations
+
+import asyncio
+import bisect
+import functools
+import itertools
+import logging
+import math
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from time import monotonic_ns
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, Self
+
+from rosasync._core.aio import until_done
+from rosasync._server.handlers import (
+    ErrorHook,
+    Handler,
+    HandlerRunner,
+    HandlerTasks,
+    OverloadHook,
+    check_hook,
+    settle_kind,
+)
+from rosasync._server.service_call import (
+    CallCounts,
+    RequestInfo,
+    ResponseSender,
+    ServiceCall,
+    service_destroyed,
+)
+from rosasync._server.sizes import payload_size
+from rosasync.errors import SessionClosed, UsageError
+from rosasync.options import check_count, check_timeout
+from rosasync.statistics import ServerStatistics
+from rosasync.tracing import ServerTracing
+from rosasync.typing import RequestT, ResponseT
+
+if TYPE_CHECKING:
+    from rosasync._core.ports import NodePort, RequestHeader
+    from rosasync.tracing import Tracing
+
+__all__ = ["Handler", "RequestInfo", "ServiceCall", "ServiceServer"]
+
+logger = logging.getLogger("rosasync")
+
+CLOSE_TIMEOUT = 5.0
+"""Seconds to wait for handlers to finish when a server is closed."""
+CANCEL_TIMEOUT = 1.0
+"""Seconds to wait for cancelled handlers to end, before they are left behind."""
+
+
+class ServiceServer(Generic[RequestT, ResponseT]):
+    """Serves a service in the loop; created by `Session.serve`, and ends with the session.
+
+    It takes requests as soon as it is created. As an async context manager it is closed at the end
+    of the block. If it has no handler, ``async for call in server:`` gives the calls.
+
+    At most ``concurrency`` handlers run at a time. Up to ``backlog`` requests, of ``backlog_bytes``
+    in total, wait their turn in the order of their arrival. They wait in Python, because the queue
+    of the middleware would overflow. A plain handler runs in the loop, and blocks it until it
+    returns. An async one runs in a task.
+
+    Confined to the loop's thread, except `ServiceCall.respond`: responses are sent from any thread,
+    several at once, and the service is destroyed only when none is being sent. rcl does not allow
+    one thread to take requests of a service while another sends responses. This cannot happen,
+    because rclpy holds the GIL during both.
+    """
+
+    def __init__(
+        self,
+        node: NodePort,
+        srv_type: Any,
+        srv_name: str,
+        handler: Handler[RequestT, ResponseT] | None,
+        *,
+        concurrency: int,
+        backlog: int,
+        backlog_bytes: int,
+        qos: Any,
+        on_error: ErrorHook[RequestT, ResponseT] | None,
+        on_overload: OverloadHook[RequestT, ResponseT] | None,
+        on_end: Callable[[ServiceServer[RequestT, ResponseT]], object],
+        tracing: Tracing,
+    ) -> None:
+        self._loop = asyncio.get_running_loop()
+        kind = settle_kind(handler)
+        check_hook("on_error", on_error)
+        self._on_overload = check_hook("on_overload", on_overload)
+        self._on_end = on_end
+        self._concurrency = check_count("concurrency", concurrency, 1)
+        self._has_handler = kind is not None
+        self._queue = _CallQueue[RequestT, ResponseT](
+            check_count("backlog", backlog, 0), check_count("backlog_bytes", backlog_bytes, 0)
+        )
+        self._counts = CallCounts()
+        self._tasks = HandlerTasks()
+        self._taking = True
+        self._ended = False
+        self._end_task: asyncio.Task[None] | None = None
+        # Whether `_start_waiting` is active, so that it is not entered again.
+        self._starting = False
+        # Whether the warning about dropped requests was logged since the backlog last shrank.
+        self._overload_logged = False
+        service = node.describe(srv_type, srv_name, qos)
+        self._name, self._type_name, _ = service.key
+        self._tracing = tracing
+        self._traces = ServerTracing(tracing, service.key)
+        self._port = node.open_service(service, self._on_request)
+        self._qos = self._port.qos
+        self._sender = ResponseSender[ResponseT](
+            self._name,
+            self._type_name,
+            service.srv_type.Response,
+            self._port,
+            self._counts,
+            self._tasks.spawn,
+            self._on_destroyed,
+        )
+        self._runner = HandlerRunner(
+            kind, on_error, self._sender, self._counts, self._tasks, self._start_waiting
+        )
+
+    def __repr__(self) -> str:
+        counts = f"{self._runner.running} running, {len(self._queue)} waiting"
+        state = "closed" if self.closed else counts
+        return f"<ServiceServer {self._name} [{self._type_name}] {state}>"
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        await self.aclose()
+
+    def __aiter__(self) -> Self:
+        return self
+
+    async def __anext__(self) -> ServiceCall[RequestT, ResponseT]:
+        """Return the next call. Several tasks may iterate: each call goes to one of them.
+
+        Raises:
+            StopAsyncIteration: the server was closed.
+            ContextShutdown: the rclpy context was shut down, or the rclpy service destroyed.
+            UsageError: the server has a handler, or runs in another loop.
+        """
+        if self._has_handler:
+            raise UsageError(f"{self._name}: a server with a handler cannot be iterated over")
+        self._check_loop("iterated over")
+        call = await self._queue.get()
+        self._overload_logged = False
+        if call is not None:
+            if call.trace is not None:
+                call.trace.enter("handling")
+            return call
+        ending = self._sender.ending
+        if ending is not None and not isinstance(error := ending(), SessionClosed):
+            raise error
+        raise StopAsyncIteration
+
+    @property
+    def srv_name(self) -> str:
+        """The resolved service name. Also available after the end."""
+        return self._name
+
+    @property
+    def srv_type(self) -> str:
+        """The service type's name."""
+        return self._type_name
+
+    @property
+    def response_type(self) -> type[ResponseT]:
+        """The class of the responses."""
+        return self._sender.response_type
+
+    @property
+    def qos(self) -> Any:
+        """A snapshot of the ``QoSProfile`` in use. Also available after the end."""
+        return self._qos
+
+    @property
+    def closed(self) -> bool:
+        """Whether the server has been closed, or its closing has begun. Never raises."""
+        return not self._taking
+
+    @property
+    def handle(self) -> Any:
+        """The ``rclpy.service.Service``, for what rosasync does not offer.
+
+        Raises:
+            SessionClosed, ContextShutdown: it has been destroyed.
+        """
+        self._sender.check_open()
+        return self._port.handle
+
+    def statistics(self) -> ServerStatistics:
+        """Return a snapshot."""
+        counts = self._counts
+        return ServerStatistics(
+            srv_name=self._name,
+            running=self._runner.running,
+            waiting=len(self._queue),
+            unanswered=counts.unanswered,
+            taken=counts.taken,
+            responded=counts.responded,
+            deferred=counts.deferred,
+            failed=counts.failed,
+            rejected=counts.rejected,
+            dropped=counts.dropped,
+            undeliverable=counts.undeliverable,
+        )
+
+    async def aclose(self, timeout: float | None = CLOSE_TIMEOUT) -> None:
+        """End the server; idempotent, and not cut short by cancellation.
+
+        It stops taking requests, and lets the handlers finish, also those of waiting requests, for
+        ``timeout`` seconds (None: without a limit). Then it cancels the rest and destroys the
+        service. Calls that are still unanswered stay unanswered. If it has responded within the
+        last half second, it first waits that long at most, within the timeout, until the clients
+        have received the responses. Otherwise the middleware would drop them with the service.
+
+        A handler may close its server, or its session, itself or in a task that it starts. It is
+        then neither waited for nor cancelled, and should have responded before.
+
+        Raises:
+            UsageError: called from another loop or thread.
+        """
+        seconds = check_timeout(timeout, None)
+        self._check_loop("closed")
+        if self._ended:
+            return
+        # First, because an eager task collects the handlers to wait for as it is created.
+        self.exclude_caller()
+        if self._end_task is None:
+            self._end_task = self._loop.create_task(self._end(seconds))
+        await until_done(self._end_task)
+
+    def exclude_caller(self) -> None:
+        """Exclude the calling handler from those that the end of the server waits for.
+
+        For the session: a handler that closes its session would otherwise wait for itself.
+        """
+        self._tasks.exclude_caller()
+
+    def check_port(self) -> None:
+        """End the server if something other than rosasync has destroyed its rclpy service.
+
+        For the session, whenever the graph changes. On the loop's thread.
+        """
+        if self._port.destroyed:
+            self._on_destroyed()
+
+    def end(self, ending: Callable[[], Exception]) -> None:
+        """End at once; idempotent.
+
+        Unanswered calls stay unanswered, and later responses get the error that ``ending`` creates.
+        For the session. On the loop's thread, or on any if the loop is closed.
+        """
+        if self._ended:
+            return
+        self._ended = True
+        try:
+            self._stop_taking()
+            self._drop_waiting()
+            self._sender.close(ending)
+            self._traces.close()
+            self._port.close()
+            if not self._loop.is_closed():
+                self._tasks.cancel()
+        finally:
+            try:
+                self._on_end(self)
+            except Exception:
+                logger.exception("%s: the session could not forget this server", self._name)
+
+    # Taking requests.
+
+    def _on_request(self, request: RequestT, header: RequestHeader) -> None:
+        if not self._taking:
+            return
+        self._counts.taken += 1
+        now = monotonic_ns()
+        trace = self._traces.start(now) if now >= self._tracing.quiet_until else None
+        call = ServiceCall(self, request, header, self._sender, now, trace)
+        if self._has_handler and not self._queue and self._runner.running < self._concurrency:
+            self._runner.start(call)
+        elif self._queue.put(call):
+            if trace is not None:
+                trace.enter("queued")
+            if self._has_handler:
+                self._start_waiting()
+        else:
+            self._overload(call)
+
+    def _start_waiting(self) -> None:
+        # An eager task (Python 3.12) may finish its handler inside `start`, which calls this again.
+        # With a long backlog that would exceed the recursion limit, so the outer call goes on.
+        if self._starting:
+            return
+        self._starting = True
+        try:
+            while self._queue and self._runner.running < self._concurrency:
+                self._overload_logged = False
+                self._runner.start(self._queue.pop())
+        finally:
+            self._starting = False
+
+    def _overload(self, call: ServiceCall[RequestT, ResponseT]) -> None:
+        self._counts.rejected += 1
+        if self._on_overload is None:
+            self._drop_overload(call)
+        else:
+            self._runner.call_hook(call, self._on_overload, (call,), self._drop_overload)
+
+    def _drop_overload(self, call: ServiceCall[RequestT, ResponseT]) -> None:
+        if call.give_up("dropped: too many requests were waiting") and not self._overload_logged:
+            self._overload_logged = True
+            logger.warning(
+                "%s: %d requests wait already, so further ones are dropped unanswered (%d so far): "
+                "raise concurrency or backlog, or answer them with on_overload",
+                self._name,
+                len(self._queue),
+                self._counts.dropped,
+            )
+
+    # Ending.
+
+    def _check_loop(self, verb: str) -> None:
+        if asyncio._get_running_loop() is not self._loop:
+            raise UsageError(
+                f"{self._name}: a server can only be {verb} in the loop that serves it"
+            )
+
+    def _on_destroyed(self) -> None:
+        self.end(functools.partial(service_destroyed, self._name))
+
+    def _stop_taking(self) -> None:
+        self._taking = False
+        self._port.stop()
+        if not self._has_handler:
+            self._queue.close()
+
+    def _drop_waiting(self) -> None:
+        if self._queue:
+            logger.warning(
+                "%s: closed with %d requests waiting, which are dropped unanswered",
+                self._name,
+                len(self._queue),
+            )
+            while self._queue:
+                self._queue.pop().give_up("dropped: the server was closed")
+
+    async def _end(self, timeout: float | None) -> None:
+        deadline = None if timeout is None else self._loop.time() + timeout
+        self._stop_taking()
+        if not self._has_handler:
+            self._drop_waiting()
+        await self._tasks.wait(deadline)
+        self._drop_waiting()
+        if self._tasks:
+            self._tasks.cancel()
+            await self._tasks.wait(self._loop.time() + CANCEL_TIMEOUT)
+            if self._tasks:
+                logger.warning(
+                    "%s: %d handlers still run although they were cancelled, and are left behind: "
+                    "a handler must not suppress CancelledError",
+                    self._name,
+                    len(self._tasks),
+                )
+        left = math.inf if deadline is None else deadline - self._loop.time()
+        await self._sender.wait_until_delivered(left)
+        await asyncio.sleep(self._port.destroy_delay)
+        self.end(functools.partial(SessionClosed, f"{self._name}: the server is closed"))
+
+
+class _Waiting(NamedTuple):
+    """A call that waits.
+
+    Attributes:
+        number: its place in the order of arrival.
+        size: the estimated number of bytes of its request.
+        call: the call.
+    """
+
+    number: int
+    size: int
+    call: ServiceCall[Any, Any]
+
+
+class _CallQueue(Generic[RequestT, ResponseT]):
+    """Calls that wait for a handler or an iterator, and iterators that wait for calls.
+
+    At most one of the two kinds waits at a time. Confined to the loop's thread.
+
+    Args:
+        limit: the maximum number of calls that wait.
+        limit_bytes: the maximum size of their requests together, unless only one call waits.
+    """
+
+    def __init__(self, limit: int, limit_bytes: int) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._limit = limit
+        self._limit_bytes = limit_bytes
+        self._bytes = 0
+        self._numbers = itertools.count()
+        self._closed = False
+        # In the order of arrival, in which `_put_back` finds a place.
+        self._calls: deque[_Waiting] = deque()
+        # Each is completed with an entry of `_calls`, or with None when the queue is closed.
+        self._getters: deque[asyncio.Future[_Waiting | None]] = deque()
+
+    def __len__(self) -> int:
+        return len(self._calls)
+
+    def put(self, call: ServiceCall[RequestT, ResponseT]) -> bool:
+        """Pass a call to the iterator that waits longest, or keep it.
+
+        Returns:
+            False if the queue is full.
+        """
+        number = next(self._numbers)
+        if self._getters and self._hand_out(_Waiting(number, 0, call)):
+            return True
+        waiting = len(self._calls)
+        if waiting >= self._limit:
+            return False
+        size = payload_size(call.request)
+        if waiting and self._bytes + size > self._limit_bytes:
+            return False
+        self._bytes += size
+        self._calls.append(_Waiting(number, size, call))
+        return True
+
+    def pop(self) -> ServiceCall[RequestT, ResponseT]:
+        """Return the call that waits longest."""
+        waiting = self._calls.popleft()
+        self._bytes -= waiting.size
+        return waiting.call
+
+    async def get(self) -> ServiceCall[RequestT, ResponseT] | None:
+        """Wait for a call; None if the queue is closed."""
+        if self._calls:
+            return self.pop()
+        if self._closed:
+            return None
+        getter: asyncio.Future[_Waiting | None] = self._loop.create_future()
+        self._getters.append(getter)
+        try:
+            entry = await getter
+        except BaseException:
+            # The task was cancelled, or its coroutine closed. The getter may still be queued, may
+            # have been removed by `_hand_out`, or may have received a call just before.
+            if not getter.done():
+                getter.cancel()
+            if getter.cancelled():
+                with suppress(ValueError):
+                    self._getters.remove(getter)
+            elif (entry := getter.result()) is not None:
+                self._put_back(entry)
+            raise
+        return None if entry is None else entry.call
+
+    def close(self) -> None:
+        """End the iterators once no call is left; idempotent."""
+        self._closed = True
+        while self._getters:
+            getter = self._getters.popleft()
+            if not getter.done() and not self._loop.is_closed():
+                getter.set_result(None)
+
+    def _hand_out(self, entry: _Waiting) -> bool:
+        while self._getters:
+            getter = self._getters.popleft()
+            if not getter.done():
+                getter.set_result(entry)
+                return True
+        return False
+
+    def _put_back(self, entry: _Waiting) -> None:
+        """Pass a call to the next iterator, or put it back in its place, even beyond the limits."""
+        if self._closed:
+            entry.call.give_up("dropped: the server was closed")
+        elif not self._hand_out(entry):
+            size = payload_size(entry.call.request)
+            self._bytes += size
+            place = bisect.bisect(self._calls, entry.number, key=lambda waiting: waiting.number)
+            self._calls.insert(place, entry._replace(size=size))
