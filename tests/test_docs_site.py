@@ -6,8 +6,10 @@ import json
 import re
 import subprocess
 import sys
+from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote, urlsplit
 
 import pytest
 from sphinx.search.en import SearchEnglish
@@ -117,6 +119,37 @@ class Search:
         return pages
 
 
+class Page(HTMLParser):
+    """What can be linked to in a page of the site, and what the page links to."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.anchors: set[str] = set()
+        self.links: set[str] = set()
+        self.feed(path.read_text())
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        for name, value in attrs:
+            if name == "id" and value:
+                self.anchors.add(value)
+            elif name in ("href", "src") and value and not urlsplit(value).scheme:
+                self.links.add(value)
+
+
+def dead_links(site: Path) -> list[str]:
+    """Return the links within the site that lead to no file, or to no anchor of a page."""
+    pages = {path: Page(path) for path in site.rglob("*.html")}
+    dead = []
+    for path, page in pages.items():
+        for link in page.links:
+            url = urlsplit(link)
+            target = (path.parent / unquote(url.path)).resolve() if url.path else path
+            anchors = pages[target].anchors if target in pages else set()
+            if not target.exists() or (url.fragment and unquote(url.fragment) not in anchors):
+                dead.append(f"{path.relative_to(site)}: {link}")
+    return sorted(dead)
+
+
 def section_of(page: str, title: str) -> str:
     """Return the one section of a page whose title begins so."""
     text = (ROOT / "docs" / f"{page}.md").read_text()
@@ -129,6 +162,8 @@ def test_the_site(tmp_path: Path) -> None:
     build = (sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "docs", str(tmp_path))
     done = subprocess.run(build, cwd=ROOT, stderr=subprocess.PIPE, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
+
+    assert dead_links(tmp_path) == []
 
     search = Search(tmp_path)
     assert len(PAINS) == 15
@@ -145,3 +180,12 @@ def test_the_site(tmp_path: Path) -> None:
     assert 'href="pool.html#rosasync.Limits.waiting"' in docstring
     pages = [page.read_text() for page in tmp_path.rglob("*.html")]
     assert not [page for page in pages if re.search(r"--8&lt;--|^<p>::: ", page, re.MULTILINE)]
+
+
+def test_dead_links_are_found(tmp_path: Path) -> None:
+    (tmp_path / "one.html").write_text(
+        '<h1 id="top">One</h1> <a href="two.html#here">a</a> <a href="two.html#there">b</a>'
+        '<a href="#top">c</a> <a href="three.html">d</a> <a href="https://ros.org/#x">e</a>'
+    )
+    (tmp_path / "two.html").write_text('<p id="here"></p>')
+    assert dead_links(tmp_path) == ["one.html: three.html", "one.html: two.html#there"]
