@@ -53,6 +53,20 @@ async def in_thread(function: Callable[..., Any], *args: Any, **options: Any) ->
     return await asyncio.to_thread(function, *args, **options)
 
 
+async def in_callback(session: Session, function: Callable[[], Any]) -> Any:
+    """Call a function on the executor's thread, as a callback of the node."""
+    outcome: Future[Any] = Future()
+
+    def callback() -> None:
+        try:
+            outcome.set_result(function())
+        except BaseException as error:
+            outcome.set_exception(error)
+
+    session.node.executor.create_task(callback)
+    return await asyncio.wrap_future(outcome)
+
+
 class TestCall:
     """``from_thread.call``."""
 
@@ -150,6 +164,20 @@ class TestSubmit:
         done = await in_thread(lambda: [answer_to(f.result(LIMIT)) for f in futures])
         assert done == [str(n) for n in range(100)]
 
+    async def test_it_works_in_a_callback_of_the_node(
+        self, session: Session, held: ServerProcess
+    ) -> None:
+        submitted = await in_callback(
+            session, lambda: session.from_thread.submit(ECHO, NAME, request_of("a"))
+        )
+        await held.received(NAME, 1)
+        # The executor goes on meanwhile.
+        assert await in_callback(session, lambda: 5) == 5
+        await held.release(NAME)
+        assert answer_to(await asyncio.wrap_future(submitted)) == "a"
+        response = await in_callback(session, submitted.result)
+        assert answer_to(response) == "a"
+
     async def test_one_wake_up_carries_a_batch(self, session: Session, echo: str) -> None:
         await session.wait_for_service(ECHO, echo)
         loop = asyncio.get_running_loop()
@@ -228,10 +256,26 @@ class TestSubmit:
 class TestMisuse:
     """Mistakes that raise at once, in the calling thread, before anything is sent."""
 
-    @pytest.mark.parametrize("way", ["call", "submit"])
-    async def test_on_the_loops_thread(self, session: Session, echo: str, way: str) -> None:
-        with pytest.raises(UsageError, match=r"await session\.call"):
+    @pytest.mark.parametrize(
+        ("way", "instead"), [("call", r"await session\.call"), ("submit", r"use session\.start")]
+    )
+    async def test_on_the_loops_thread(
+        self, session: Session, echo: str, way: str, instead: str
+    ) -> None:
+        with pytest.raises(UsageError, match=instead):
             getattr(session.from_thread, way)(ECHO, echo)
+
+    @pytest.mark.parametrize("way", ["result", "exception"])
+    async def test_the_loop_waits_for_a_future(
+        self, session: Session, held: ServerProcess, way: str
+    ) -> None:
+        future = await in_thread(session.from_thread.submit, ECHO, NAME, request_of("a"))
+        with pytest.raises(UsageError, match=r"asyncio\.wrap_future"):
+            getattr(future, way)()
+        await held.received(NAME, 1)
+        await held.release(NAME)
+        assert answer_to(await asyncio.wrap_future(future)) == "a"
+        assert answer_to(future.result()) == "a"
 
     def test_on_the_loops_thread_while_the_loop_does_not_run(self) -> None:
         with asyncio.Runner() as runner:
@@ -240,22 +284,23 @@ class TestMisuse:
                 session.from_thread.call(ECHO, NAME)
             runner.run(session.aclose())
 
-    @pytest.mark.parametrize("way", ["call", "submit"])
-    async def test_on_the_executors_thread(self, session: Session, echo: str, way: str) -> None:
-        raised: Future[BaseException | None] = Future()
+    async def test_a_blocking_call_on_the_executors_thread(
+        self, session: Session, echo: str
+    ) -> None:
+        with pytest.raises(UsageError, match=r"executor's thread.*from_thread\.submit"):
+            await in_callback(session, lambda: session.from_thread.call(ECHO, echo))
 
+    @pytest.mark.parametrize("way", ["result", "exception"])
+    async def test_the_executors_thread_waits_for_a_future(
+        self, session: Session, held: ServerProcess, way: str
+    ) -> None:
         def callback() -> None:
-            try:
-                getattr(session.from_thread, way)(ECHO, echo)
-            except BaseException as error:
-                raised.set_result(error)
-            else:
-                raised.set_result(None)
+            getattr(session.from_thread.submit(ECHO, NAME), way)(LIMIT)
 
-        session.node.executor.create_task(callback)
-        error = await asyncio.wrap_future(raised)
-        assert isinstance(error, UsageError)
-        assert "executor's thread" in str(error)
+        with pytest.raises(UsageError, match=r"executor's thread.*add_done_callback"):
+            await in_callback(session, callback)
+        await held.received(NAME, 1)
+        await held.release(NAME)
 
     @pytest.mark.parametrize(
         ("error", "arguments", "options"),

@@ -7,7 +7,7 @@ import contextlib
 import contextvars
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import CancelledError, Future, InvalidStateError
 from copy import deepcopy
 from typing import TYPE_CHECKING, Any, overload
@@ -36,10 +36,11 @@ MARGIN = 1.0
 class Portal:
     """Calls services from threads other than the loop's: ``session.from_thread``.
 
-    For worker threads, GUI toolkits and libraries that block; in the loop, use `Session.call`. On
-    the loop's own thread, and on the session's executor thread (which runs the node's callbacks), a
-    call would deadlock and raises `UsageError`. If another executor spins the node, do not block in
-    its callbacks either.
+    For worker threads, GUI toolkits and libraries that block, and for the callbacks of the
+    session's node; in the loop, use `Session.call` and `Session.start`. On the loop's own thread,
+    and on the session's executor thread (which runs the node's callbacks), waiting for a response
+    would deadlock and raises `UsageError`. `submit` does not wait, so it works in these callbacks.
+    If another executor spins the node, do not block in its callbacks either.
     """
 
     def __init__(
@@ -105,6 +106,8 @@ class Portal:
         Raises:
             UsageError: on the loop's thread, or the executor's: it would deadlock.
         """
+        self._check_loop("call")
+        self._check_executor()
         submission = self._submission(srv_type, srv_name, request, timeout, qos, wait, retry)
         submission.submit()
         return submission.wait()
@@ -148,14 +151,19 @@ class Portal:
     ) -> Future[Any]:
         """Start the same call and return at once. Cancelling the future cancels the call.
 
+        It works in the callbacks of the session's node too, but do not wait for the future there:
+        while it is not done, its ``result()`` and ``exception()`` raise `UsageError` on the
+        executor's thread and the loop's. ``add_done_callback`` says what happens with the response;
+        it is called on the loop's thread, or at once if the call is done by then.
+
         The request is copied, so it may be changed afterwards. For the arguments, see
         `Session.call`. Wrong arguments raise here, everything later is raised by the future.
 
         Raises:
-            UsageError: on the loop's thread, or the executor's. Use an `AsyncServiceProxy` or
-                ``asyncio.run_coroutine_threadsafe`` there.
+            UsageError: on the loop's thread; use `Session.start` there.
             SessionClosed: the session is closed.
         """
+        self._check_loop("start")
         submission = self._submission(
             srv_type, srv_name, request, timeout, qos, wait, retry, copy=request is not None
         )
@@ -173,26 +181,37 @@ class Portal:
         retry: Retry | None,
         copy: bool = False,
     ) -> _Submission:
-        self._check_thread()
         service = self._arguments.service(srv_type, srv_name, qos)
         message, seconds = self._arguments.call(
             service, request, timeout, self._timeout, wait, retry
         )
         if copy:
             message = deepcopy(message)
-        return _Submission(self._gateway, self._pool, service, message, seconds, wait, retry)
+        return _Submission(
+            self._gateway,
+            self._pool,
+            self._check_executor,
+            service,
+            message,
+            seconds,
+            wait,
+            retry,
+        )
 
-    def _check_thread(self) -> None:
+    def _check_loop(self, instead: str) -> None:
         self._gateway.check_open()
         if self._gateway.on_thread or self._gateway.on_loop:
             raise UsageError(
-                "session.from_thread would block the session's own loop: use await session.call"
+                "session.from_thread is for other threads, and this is the thread of the session's "
+                f"own loop: use {'await ' if instead == 'call' else ''}session.{instead}(…)"
             )
+
+    def _check_executor(self) -> None:
         if self._node.executor_thread == threading.get_ident():
             raise UsageError(
-                "session.from_thread would block the executor's thread, which runs this callback: "
-                "use asyncio.run_coroutine_threadsafe(session.call(…), loop) or an "
-                "AsyncServiceProxy"
+                "this is the executor's thread, which runs this callback, and waiting here for a "
+                "response would stop all callbacks: use session.from_thread.submit(…), and "
+                "add_done_callback for what to do with the response"
             )
 
 
@@ -206,6 +225,7 @@ class _Submission(Future[Any]):
         self,
         gateway: LoopGateway,
         pool: ClientPool,
+        check_executor: Callable[[], None],
         service: Service,
         request: Any,
         timeout: float | None,
@@ -215,6 +235,7 @@ class _Submission(Future[Any]):
         super().__init__()
         self._gateway = gateway
         self._pool = pool
+        self._check_executor = check_executor
         self._service = service
         self._request = request
         self._timeout = timeout
@@ -245,12 +266,22 @@ class _Submission(Future[Any]):
             self.set_exception(error)
 
     def result(self, timeout: float | None = None) -> Any:
-        """Wait as ``concurrent.futures.Future.result`` does, also if the loop has vanished."""
+        """Wait as ``concurrent.futures.Future.result`` does, also if the loop has vanished.
+
+        Raises:
+            UsageError: it is not done, and this is a thread that it needs to become so.
+        """
+        self._check_wait()
         self._watch(timeout)
         return super().result(0)
 
     def exception(self, timeout: float | None = None) -> BaseException | None:
-        """Wait as ``concurrent.futures.Future.exception`` does, also if the loop has vanished."""
+        """Wait as ``concurrent.futures.Future.exception`` does, also if the loop has vanished.
+
+        Raises:
+            UsageError: it is not done, and this is a thread that it needs to become so.
+        """
+        self._check_wait()
         self._watch(timeout)
         return super().exception(0)
 
@@ -276,6 +307,16 @@ class _Submission(Future[Any]):
             srv_type=srv_type,
             elapsed=elapsed,
         )
+
+    def _check_wait(self) -> None:
+        """Raise `UsageError` on a thread that must not wait for this, unless it is done."""
+        if self.done() or self._gateway.closed:
+            return
+        if self._gateway.on_thread or self._gateway.on_loop:
+            raise UsageError(
+                "the session's own loop would wait for itself: use await asyncio.wrap_future(…)"
+            )
+        self._check_executor()
 
     def _watch(self, timeout: float | None) -> None:
         """Wait until this is done, the loop is closed, or ``timeout`` seconds have passed."""
