@@ -14,6 +14,7 @@ from __future__ import annotations
 import asyncio
 import contextvars
 import time
+import weakref
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass
@@ -127,7 +128,7 @@ class OpenTelemetryTrace:
         span.end(end.time_ns + running.to_epoch)
 
     def observe_pool(self, session: Session, pool_name: str) -> None:
-        """Measure the pool of an open session until it is closed.
+        """Measure the pool of an open session until it is closed, or dropped.
 
         ``db.client.connection.count`` is the number of clients, by ``db.client.connection.state``,
         ``"idle"`` or ``"used"``. ``db.client.connection.pending_requests`` is the number of callers
@@ -189,17 +190,18 @@ class _Running:
 
 
 class _Pool:
-    """Takes snapshots of the pool of one session, on any thread."""
+    """Takes snapshots of the pool of one session, on any thread. Does not keep the session."""
 
     def __init__(self, session: Session, name: str) -> None:
         self.name = name
         self._pool = session.pool
-        self._session = session
+        self._session = weakref.ref(session)
         self._loop = asyncio.get_running_loop()
 
     @property
     def closed(self) -> bool:
-        return self._session.closed
+        session = self._session()
+        return session is None or session.closed
 
     def services(self) -> Mapping[ServiceKey, KeyStatistics]:
         """Return the statistics of each service; none if the loop does not answer in time."""

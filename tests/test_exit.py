@@ -27,6 +27,18 @@ class TestLeftOpen:
         assert f"ResourceWarning: unclosed <Session 'left_open' {bridge} bridge" in errors
         assert "Traceback" not in errors
 
+    @pytest.mark.parametrize("kept", ["session = ", ""], ids=["held", "dropped"])
+    async def test_if_the_warning_is_an_error(self, bridge: Bridge, kept: str) -> None:
+        program = f"""
+import threading, warnings
+warnings.simplefilter("error", ResourceWarning)
+{kept}asyncio.run(opened(bridge))
+"""
+        code, errors = await run_program(bridge, program)
+        assert code == 0, errors
+        assert "ResourceWarning: unclosed <Session 'left_open'" in errors
+        assert "terminate called" not in errors
+
     async def test_dropped_in_a_loop_that_goes_on(self, bridge: Bridge) -> None:
         program = """
 import gc, threading

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import gc
 import threading
+import weakref
 from typing import Any
 
 import pytest
@@ -128,3 +129,27 @@ async def test_a_gateway_closed_inside_post_takes_nothing() -> None:
         gateway.post(ran.append, 1)
     await asyncio.sleep(0)
     assert ran == []
+
+
+def test_what_a_closed_loop_has_not_run_is_dropped() -> None:
+    """The executor thread refers to the gateway, and a callback may refer to the session."""
+
+    class Referred:
+        def callback(self) -> None:
+            raise AssertionError("never called")
+
+    async def make() -> LoopGateway:
+        return LoopGateway()
+
+    loop = asyncio.new_event_loop()
+    gateway = loop.run_until_complete(make())
+    referred = Referred()
+    reference = weakref.ref(referred)
+    gateway.post(referred.callback)
+    del referred
+    assert reference() is not None
+    loop.close()
+    gc.collect()
+    assert reference() is None
+    with pytest.raises(SessionClosed):
+        gateway.post(print)

@@ -292,6 +292,18 @@ class TestMetrics:
         loop.run_until_complete(session.aclose())
         loop.close()
 
+    async def test_it_does_not_keep_a_session_that_is_dropped(
+        self, fake_graph: FakeGraph, telemetry: Telemetry
+    ) -> None:
+        session = fake_graph.session()
+        await session.__aenter__()
+        telemetry.trace.observe_pool(session, "mine")
+        sessions = [session]
+        del session
+        with pytest.warns(ResourceWarning, match="unclosed"):
+            sessions.clear()
+        assert telemetry.points("db.client.connection.count") == []
+
     async def test_a_session_that_is_not_open(self, telemetry: Telemetry) -> None:
         with pytest.raises(UsageError):
             telemetry.trace.observe_pool(Session("unopened"), "mine")

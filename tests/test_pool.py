@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import logging
 import random
+import sys
+import threading
 import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
@@ -591,3 +593,27 @@ async def test_reprs_tell_state_and_counts(fake_graph: FakeGraph) -> None:
             assert repr(client) == "<LeasedClient /echo idle>"
         assert repr(session.client(Echo, "/echo")).startswith("<ServiceClient /echo")
     assert repr(session) == "<Session 'fake' closed>"
+
+
+async def test_a_repr_in_another_thread_while_services_are_added(
+    fake_graph: FakeGraph,
+) -> None:
+    async with fake_graph.session() as session:
+        ended = threading.Event()
+
+        def look() -> None:
+            while not ended.is_set():
+                assert "services" in repr(session)
+
+        interval = sys.getswitchinterval()
+        sys.setswitchinterval(1e-6)
+        try:
+            looking = asyncio.create_task(asyncio.to_thread(look))
+            for service in range(200):
+                session.client(Echo, f"/echo_{service}")
+                await asyncio.sleep(0)
+            ended.set()
+            await looking
+        finally:
+            ended.set()
+            sys.setswitchinterval(interval)

@@ -22,6 +22,7 @@ from rosasync import (
     UsageError,
 )
 from rosasync._core.ports import PortDestroyed
+from tests.support.checks import count_threads
 from tests.support.echo import ECHO
 from tests.support.serving import (
     AnyCall,
@@ -271,6 +272,23 @@ class TestClose:
             sessions.clear()
         await until(lambda: server.closed)
         assert server.statistics().responded == 1
+
+    async def test_with_a_session_that_is_dropped_if_the_warning_is_an_error(
+        self, bridge: Bridge, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """As pytest's ``filterwarnings = error`` makes it."""
+        raised: list[Any] = []
+        monkeypatch.setattr("sys.unraisablehook", lambda hook: raised.append(hook.exc_type))
+        before = count_threads()
+        session = Session("dropped", bridge=bridge)
+        await session.__aenter__()
+        server = session.serve(ECHO, "/served", echo_call)
+        sessions = [session]
+        del session
+        sessions.clear()
+        assert raised == [ResourceWarning]
+        await until(lambda: server.closed)
+        await until(lambda: count_threads() <= before)
 
 
 class TestLastResponses:

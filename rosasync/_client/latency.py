@@ -53,7 +53,8 @@ class LatencyHistogram:
 
     def include(self, other: LatencyHistogram) -> None:
         """Count the durations of another histogram as well."""
-        for bits, counts in other.octaves.items():
+        # A copy, because the loop may count another response meanwhile.
+        for bits, counts in other.octaves.copy().items():
             self.octaves[bits] = array("Q", map(add, self.octaves[bits], counts))
         self.longest = max(self.longest, other.longest)
 

@@ -149,10 +149,12 @@ class ClientPool:
 
     def statistics(self) -> PoolStatistics:
         """Take a snapshot of the pool, in total and for each service."""
-        keys = {key: service.statistics() for key, service in self._services.items()}
+        # A copy, because `__repr__` may run in any thread, and a loop over the original would fail.
+        services = self._services.copy()
+        keys = {key: service.statistics() for key, service in services.items()}
         names = [name for name in KeyStatistics.__dataclass_fields__ if name != "latency"]
         total = {name: sum(getattr(s, name) for s in keys.values()) for name in names}
-        latency = summarize(service.latencies for service in self._services.values())
+        latency = summarize(service.latencies for service in services.values())
         return PoolStatistics(**total, latency=latency, keys=keys)
 
     # For the session.

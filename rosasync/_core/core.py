@@ -121,7 +121,7 @@ class Core:
         The garbage collector may run this while the thread holds any lock. So it takes none, which
         also rules out a ``threading.Thread``.
         """
-        _warn_unclosed(session)
+        warning = f"unclosed {session!r}"
         self.closed = True
         self.node.stop()
         try:
@@ -129,6 +129,8 @@ class Core:
         except RuntimeError:
             # The loop is closed.
             _thread.start_new_thread(self._clean_up, ())
+        # Last, because a filter may turn the warning into an error.
+        _warn(warning, session)
 
     def _abandon(self) -> None:
         self.pool.end(session_closed)
@@ -145,14 +147,17 @@ class Core:
     def _exit(self) -> None:
         """End the executor thread, because the interpreter aborts if it exits while one spins."""
         session = self._session()
+        warning = None
         if session is not None and not self.closed:
-            _warn_unclosed(session)
+            warning = f"unclosed {session!r}"
             self.closed = True
         elif self.closed and self._end_task is None and self.loop.is_closed():
             self._cleaned_up.wait(END_TIMEOUT)
         self.node.stop()
         self.gateway.close()
         self.node.join()
+        if warning is not None:
+            _warn(warning, session)
 
     async def _end(self) -> None:
         # Each step also if the end of the loop cancels this task, as `asyncio.run` does.
@@ -203,5 +208,5 @@ def session_closed() -> SessionClosed:
     return SessionClosed("the session is closed: open a new one")
 
 
-def _warn_unclosed(session: object) -> None:
-    warnings.warn(f"unclosed {session!r}", ResourceWarning, source=session, stacklevel=2)
+def _warn(message: str, session: object) -> None:
+    warnings.warn(message, ResourceWarning, source=session, stacklevel=3)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import threading
+import weakref
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -20,6 +21,20 @@ class Pending(Protocol):
         """End with an error, unless it has ended already. From any thread."""
 
 
+class _Batch(list[tuple[Callable[..., object], tuple[Any, ...]]]):
+    """Callbacks that wait for their turn of the loop.
+
+    Only the loop refers to a batch. So when the loop ends without that turn, the callbacks are
+    dropped with it, and cannot keep a dropped session alive.
+    """
+
+    __slots__ = ("__weakref__",)
+
+
+NO_BATCH = weakref.ref(_Batch())
+"""A reference to nothing."""
+
+
 class LoopGateway:
     """Runs callbacks on the loop's thread, with one wake-up for each batch.
 
@@ -33,7 +48,7 @@ class LoopGateway:
         self._thread = threading.get_ident()
         # Reentrant, because the garbage collector may run a __del__ that posts inside `post`.
         self._lock = threading.RLock()
-        self._calls: list[tuple[Callable[..., object], tuple[Any, ...]]] = []
+        self._batch = NO_BATCH
         # Needs no lock: each change is a single operation, which is atomic.
         self._pending: dict[Pending, None] = {}
         self._closed = False
@@ -71,13 +86,17 @@ class LoopGateway:
         """
         with self._lock:
             self.check_open()
-            self._calls.append((callback, args))
-            if len(self._calls) == 1:
+            batch = self._batch()
+            if batch is not None:
+                batch.append((callback, args))
+            else:
+                batch = _Batch([(callback, args)])
+                self._batch = weakref.ref(batch)
                 try:
-                    self.loop.call_soon_threadsafe(self._drain)
+                    self.loop.call_soon_threadsafe(self._drain, batch)
                 except RuntimeError:
                     # The loop was closed, on its own thread, since the check.
-                    self._calls.clear()
+                    self._batch = NO_BATCH
             self.check_open()
 
     def post_if_open(self, callback: Callable[..., object], *args: Any) -> None:
@@ -105,15 +124,17 @@ class LoopGateway:
         """Drop the callbacks that have not run, and fail the operations; idempotent."""
         with self._lock:
             self._closed = True
-            self._calls = []
+            if (batch := self._batch()) is not None:
+                batch.clear()
         for operation in tuple(self._pending):
             operation.fail(SessionClosed("the session is closed: open a new one"))
         self._pending.clear()
 
-    def _drain(self) -> None:
+    def _drain(self, batch: _Batch) -> None:
         with self._lock:
-            calls, self._calls = self._calls, []
-        for callback, args in calls:
+            if self._batch() is batch:
+                self._batch = NO_BATCH
+        for callback, args in batch:
             try:
                 callback(*args)
             except Exception as error:
