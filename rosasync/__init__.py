@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from rosasync._actions.status import GoalStatus
 from rosasync._client.pool import ClientPool, LeasedClient
 from rosasync._core.futures import wrap_future
 from rosasync._core.portal import Portal
@@ -10,7 +11,13 @@ from rosasync._ros.messages import to_dict, to_message
 from rosasync._server.server import RequestInfo, ServiceCall, ServiceServer
 from rosasync.errors import (
     CallError,
+    CancelRejected,
     ContextShutdown,
+    GoalAborted,
+    GoalCanceled,
+    GoalError,
+    GoalRejected,
+    GoalTimeout,
     InvalidServiceName,
     PoolFull,
     QueueTimeout,
@@ -32,15 +39,23 @@ from rosasync.statistics import (
     SessionStatistics,
 )
 from rosasync.tracing import CallEnd, CallPhase, Trace, TracedCall
-from rosasync.typing import ServiceType
+from rosasync.typing import ActionType, ServiceType
 
 __all__ = [
+    "ActionType",
     "AsyncServiceProxy",
     "CallEnd",
     "CallError",
     "CallPhase",
+    "CancelRejected",
     "ClientPool",
     "ContextShutdown",
+    "GoalAborted",
+    "GoalCanceled",
+    "GoalError",
+    "GoalRejected",
+    "GoalStatus",
+    "GoalTimeout",
     "InvalidServiceName",
     "KeyStatistics",
     "LatencyStatistics",

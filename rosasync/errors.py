@@ -12,7 +12,13 @@
         ├── ServiceUnavailable   (TimeoutError) no server
         ├── QueueTimeout         (TimeoutError) the deadline passed while waiting for a client
         ├── ResponseTimeout      (TimeoutError) sent, and not answered in time
-        └── ServerGone           (ConnectionError) every server vanished before it answered
+        ├── ServerGone           (ConnectionError) every server vanished before it answered
+        └── GoalError            .goal_id: a goal of an action that did not succeed
+            ├── GoalRejected     the server did not accept it, or does not know it
+            ├── GoalAborted      .result: the server gave up
+            ├── GoalCanceled     .result: it was cancelled
+            ├── GoalTimeout      (TimeoutError) not accepted, or not ended, in time
+            └── CancelRejected   the server does not cancel it
 
 Besides these, a message of the wrong type is a ``TypeError`` and a value out of range a
 ``ValueError``, both before anything is sent.
@@ -22,10 +28,17 @@ from __future__ import annotations
 
 from functools import partial
 from typing import Any
+from uuid import UUID
 
 __all__ = [
     "CallError",
+    "CancelRejected",
     "ContextShutdown",
+    "GoalAborted",
+    "GoalCanceled",
+    "GoalError",
+    "GoalRejected",
+    "GoalTimeout",
     "InvalidServiceName",
     "PoolFull",
     "QueueTimeout",
@@ -36,6 +49,10 @@ __all__ = [
     "SessionClosed",
     "UsageError",
 ]
+
+
+NO_GOAL = UUID(int=0)
+"""The UUID of an error that a handler raises: rosasync knows the goal by then."""
 
 
 class RosasyncError(Exception):
@@ -105,3 +122,61 @@ class ResponseTimeout(CallError, TimeoutError):
 
 class ServerGone(CallError, ConnectionError):
     """Every server that could answer vanished while the request was outstanding."""
+
+
+class GoalError(CallError):
+    """A goal of an action that did not succeed.
+
+    The handler of an action server raises it with its message and, if it has one, its result.
+
+    Attributes:
+        srv_name: the action's name.
+        srv_type: the action type's name, ``"test_msgs/action/Fibonacci"``.
+        elapsed: seconds from the start of the goal to the error.
+        goal_id: the goal's UUID.
+        result: what the server sent as the result; None if there is none.
+    """
+
+    def __init__(
+        self,
+        message: str = "",
+        *,
+        srv_name: str = "",
+        srv_type: str = "",
+        elapsed: float = 0.0,
+        goal_id: UUID = NO_GOAL,
+        result: Any = None,
+    ) -> None:
+        super().__init__(message, srv_name=srv_name, srv_type=srv_type, elapsed=elapsed)
+        self.goal_id = goal_id
+        self.result = result
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        make = partial(
+            type(self),
+            srv_name=self.srv_name,
+            srv_type=self.srv_type,
+            elapsed=self.elapsed,
+            goal_id=self.goal_id,
+        )
+        return make, self.args, self.__dict__
+
+
+class GoalRejected(GoalError):
+    """The server did not accept the goal, or does not know it."""
+
+
+class GoalAborted(GoalError):
+    """The server gave up; `result` is what it sent."""
+
+
+class GoalCanceled(GoalError):
+    """The goal was cancelled, by this client or another; `result` is what the server sent."""
+
+
+class GoalTimeout(GoalError, TimeoutError):
+    """The deadline passed before the goal was accepted, or before it ended."""
+
+
+class CancelRejected(GoalError):
+    """The server does not cancel the goal."""

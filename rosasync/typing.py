@@ -1,4 +1,4 @@
-"""ServiceType: the shape of a service class, from which calls take their types."""
+"""The shapes of service and action classes, from which calls and goals take their types."""
 
 from __future__ import annotations
 
@@ -6,9 +6,15 @@ from types import EllipsisType
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar
 
 __all__ = [
+    "ActionType",
+    "FeedbackT",
+    "FeedbackT_co",
+    "GoalT",
     "RequestT",
     "ResponseT",
     "ResponseT_co",
+    "ResultT",
+    "ResultT_co",
     "ServiceType",
     "Timeout",
 ]
@@ -19,9 +25,17 @@ if TYPE_CHECKING:
 
     RequestT = DefaultTypeVar("RequestT", default=Any)
     ResponseT = DefaultTypeVar("ResponseT", default=Any)
+    GoalT = DefaultTypeVar("GoalT", default=Any)
+    ResultT = DefaultTypeVar("ResultT", default=Any)
+    FeedbackT = DefaultTypeVar("FeedbackT", default=Any)
 else:
     RequestT = TypeVar("RequestT")
     ResponseT = TypeVar("ResponseT")
+    GoalT = TypeVar("GoalT")
+    ResultT = TypeVar("ResultT")
+    FeedbackT = TypeVar("FeedbackT")
+ResultT_co = TypeVar("ResultT_co", covariant=True)
+FeedbackT_co = TypeVar("FeedbackT_co", covariant=True)
 ResponseT_co = TypeVar("ResponseT_co", covariant=True)
 
 Timeout: TypeAlias = float | EllipsisType | None
@@ -43,4 +57,20 @@ class ServiceType(Protocol[RequestT, ResponseT_co]):  # type: ignore[misc]
 
     def Response(self) -> ResponseT_co:
         """Make a response."""
+        ...
+
+
+class ActionType(Protocol[GoalT, ResultT_co, FeedbackT_co]):  # type: ignore[misc]
+    """An action class, such as ``nav2_msgs.action.NavigateToPose``; every generated one fits."""
+
+    def Goal(self) -> GoalT:
+        """Make a goal."""
+        ...
+
+    def Result(self) -> ResultT_co:
+        """Make a result."""
+        ...
+
+    def Feedback(self) -> FeedbackT_co:
+        """Make a feedback message."""
         ...

@@ -5,11 +5,12 @@ from __future__ import annotations
 import copy
 import multiprocessing
 import pickle
+from uuid import UUID
 
 import pytest
 
 import rosasync
-from rosasync import CallError, RosasyncError
+from rosasync import CallError, GoalError, RosasyncError
 from tests.support.times import LIMIT
 
 KINDS = [
@@ -18,11 +19,20 @@ KINDS = [
     rosasync.QueueTimeout,
     rosasync.ResponseTimeout,
     rosasync.ServerGone,
+    rosasync.GoalError,
+    rosasync.GoalRejected,
+    rosasync.GoalAborted,
+    rosasync.GoalCanceled,
+    rosasync.GoalTimeout,
+    rosasync.CancelRejected,
 ]
 
 
 def make(kind: type[CallError]) -> CallError:
     error = kind("/echo: no", srv_name="/echo", srv_type="std_srvs/srv/SetBool", elapsed=1.5)
+    if isinstance(error, GoalError):
+        error.goal_id = UUID(int=7)
+        error.result = ["a result"]
     error.add_note("a note")
     return error
 
@@ -32,8 +42,9 @@ def fail(kind: type[CallError]) -> None:
 
 
 def details(error: CallError) -> tuple[object, ...]:
+    own = (error.goal_id, error.result) if isinstance(error, GoalError) else ()
     notes = error.__notes__
-    return type(error), str(error), error.srv_name, error.srv_type, error.elapsed, notes
+    return type(error), str(error), error.srv_name, error.srv_type, error.elapsed, notes, *own
 
 
 @pytest.mark.parametrize("kind", KINDS)

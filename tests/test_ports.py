@@ -7,10 +7,13 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Any, Literal
 
 import pytest
+from action_msgs.msg import GoalStatus, GoalStatusArray
+from test_msgs.action import Fibonacci
 
 from rosasync import InvalidServiceName
+from rosasync._actions.status import read_statuses, uuid_bytes
 from rosasync._core.gateway import LoopGateway
-from rosasync._core.ports import ClientPort, NodePort
+from rosasync._core.ports import ClientPort, NodePort, TopicQos
 from rosasync._ros.node import RosNode
 from rosasync.options import Limits, SessionOptions
 from rosasync.testing import FakeGraph, FakeNode
@@ -185,3 +188,126 @@ async def test_what_is_seen_instead(world: World) -> None:
     await until(world.servers)
     assert "/port_echo" in world.node.explain_missing(missing)
     assert world.node.ok()
+
+
+def feedback(*sequence: int) -> Any:
+    message = Fibonacci.Impl.FeedbackMessage()
+    message.goal_id.uuid = [len(sequence)] * 16
+    message.feedback.sequence = sequence
+    return message
+
+
+def sequences(messages: list[Any]) -> list[tuple[int, ...]]:
+    return [tuple(message.feedback.sequence) for message in messages]
+
+
+async def test_messages_come_on_the_loop_in_order_and_never_within_publish(world: World) -> None:
+    message_type = Fibonacci.Impl.FeedbackMessage
+    arrived: list[Any] = []
+    subscription = world.node.open_subscription(
+        message_type, "/port_topic", TopicQos(1000), arrived.append
+    )
+    publisher = world.node.open_publisher(message_type, "/port_topic", TopicQos(1000))
+    await until(lambda: publisher.subscriptions() and subscription.publishers())
+    for i in range(300):
+        publisher.publish(feedback(i))
+    assert arrived == []
+    await until(lambda: len(arrived) == 300)
+    assert sequences(arrived) == [(i,) for i in range(300)]
+    publisher.close()
+    publisher.close()
+    await until(lambda: not subscription.publishers())
+    subscription.close()
+    subscription.close()
+
+
+async def test_a_raw_subscription_gets_bytes_with_the_uuid_of_the_goal(world: World) -> None:
+    message_type = Fibonacci.Impl.FeedbackMessage
+    arrived: list[Any] = []
+    subscription = world.node.open_subscription(
+        message_type, "/port_topic", TopicQos(), arrived.append, raw=True
+    )
+    publisher = world.node.open_publisher(message_type, "/port_topic", TopicQos())
+    await until(lambda: publisher.subscriptions() and subscription.publishers())
+    publisher.publish(feedback(3, 4))
+    await until(lambda: arrived)
+    assert uuid_bytes(arrived[0]) == bytes([2] * 16)
+    message = world.node.deserialize(message_type, arrived[0])
+    assert sequences([message]) == [(3, 4)]
+    with pytest.raises(ValueError, match="cannot be read|not a message"):
+        world.node.deserialize(message_type, b"\0\1")
+    publisher.close()
+    subscription.close()
+
+
+async def test_a_latched_topic_has_its_newest_messages_for_those_who_come_later(
+    world: World,
+) -> None:
+    latched = TopicQos(depth=1, latched=True)
+    arrived: list[Any] = []
+    publisher = world.node.open_publisher(GoalStatusArray, "/port_status", latched)
+    for status in (1, 2):
+        publisher.publish(GoalStatusArray(status_list=[GoalStatus(status=status)]))
+    subscription = world.node.open_subscription(
+        GoalStatusArray, "/port_status", latched, arrived.append
+    )
+    await until(lambda: arrived)
+    assert [message.status_list[0].status for message in arrived] == [2]
+    publisher.close()
+    subscription.close()
+
+
+async def test_no_message_comes_after_close(world: World) -> None:
+    message_type = Fibonacci.Impl.FeedbackMessage
+    arrived: list[Any] = []
+    others: list[Any] = []
+    closed = world.node.open_subscription(message_type, "/port_topic", TopicQos(), arrived.append)
+    other = world.node.open_subscription(message_type, "/port_topic", TopicQos(), others.append)
+    publisher = world.node.open_publisher(message_type, "/port_topic", TopicQos())
+    await until(lambda: publisher.subscriptions() == 2)
+    await until(lambda: closed.publishers() and other.publishers())
+    publisher.publish(feedback(1))
+    closed.close()
+    await until(lambda: others)
+    assert arrived == []
+    other.close()
+    publisher.close()
+
+
+async def test_an_action_is_described_by_its_services_and_topics(world: World) -> None:
+    action = world.node.describe_action("test_msgs/action/Fibonacci", "port_action")
+    assert action.action_type is Fibonacci
+    assert (action.name, action.type_name) == ("/port_action", "test_msgs/action/Fibonacci")
+    assert action.send_goal.key.srv_name == "/port_action/_action/send_goal"
+    assert action.cancel_goal.key.srv_type == "action_msgs/srv/CancelGoal"
+    assert action.get_result.key.srv_type == "test_msgs/action/Fibonacci_GetResult"
+    with pytest.raises(InvalidServiceName, match="'with space' is not a valid action name"):
+        world.node.describe_action(Fibonacci, "with space")
+    with pytest.raises(ValueError, match="did you mean 'test_msgs/action/Fibonacci'"):
+        world.node.describe_action("test_msgs/action/Fibonaci", "/port_action")
+    with pytest.raises(TypeError, match="not an action"):
+        world.node.describe_action(service_class(ECHO), "/port_action")
+
+
+async def test_statuses_are_read_without_deserializing_them(world: World) -> None:
+    if world.node.bridge == "fake":
+        return  # It serializes nothing.
+    arrived: list[bytes] = []
+    subscription = world.node.open_subscription(
+        GoalStatusArray, "/port_status", TopicQos(), arrived.append, raw=True
+    )
+    publisher = world.node.open_publisher(GoalStatusArray, "/port_status", TopicQos())
+    await until(lambda: publisher.subscriptions() and subscription.publishers())
+    for count in (0, 1, 2, 5):
+        message = GoalStatusArray(status_list=[GoalStatus(status=i + 1) for i in range(count)])
+        for i, status in enumerate(message.status_list):
+            status.goal_info.goal_id.uuid = [i] * 16
+        publisher.publish(message)
+    await until(lambda: len(arrived) == 4)
+    for count, serialized in zip((0, 1, 2, 5), arrived, strict=True):
+        statuses = read_statuses(serialized)
+        assert statuses is not None
+        assert list(statuses) == [(bytes([i] * 16), i + 1) for i in range(count)]
+        assert read_statuses(serialized[:-1]) is None or count == 0
+    publisher.close()
+    subscription.close()

@@ -9,16 +9,21 @@ from typing import Any, Protocol
 from rosasync.statistics import ServiceKey
 
 __all__ = [
+    "Action",
     "ClientPort",
     "Deliver",
+    "DeliverMessage",
     "DeliverRequest",
     "NodePort",
     "PortDestroyed",
+    "PublisherPort",
     "RequestHeader",
     "RequestId",
     "Servers",
     "Service",
     "ServicePort",
+    "SubscriptionPort",
+    "TopicQos",
     "Undeliverable",
     "Unmatched",
 ]
@@ -26,13 +31,16 @@ __all__ = [
 Deliver = Callable[[int, Any], None]
 """Called on the loop's thread with a sequence number and the response to it."""
 
+DeliverMessage = Callable[[Any], None]
+"""Called on the loop's thread with a message of a topic: bytes if the subscription is raw."""
+
 
 Servers = frozenset[Hashable]
 """The identities of servers."""
 
 
 class PortDestroyed(Exception):
-    """The rclpy client or service was destroyed by something other than rosasync."""
+    """The rclpy entity was destroyed by something other than rosasync."""
 
 
 class Undeliverable(Exception):
@@ -58,6 +66,44 @@ class Service:
     srv_name: str
     qos: Any
     key: ServiceKey
+
+
+@dataclass(frozen=True, slots=True)
+class Action:
+    """An action type and name, checked and resolved.
+
+    Attributes:
+        action_type: the action class.
+        name: the resolved name.
+        type_name: the name of the type, ``"test_msgs/action/Fibonacci"``.
+        send_goal: the service that accepts goals.
+        cancel_goal: the service that cancels them.
+        get_result: the service that answers when a goal has ended.
+        feedback_topic: the name of the feedback topic, for `NodePort.open_subscription`.
+        status_topic: the name of the status topic.
+    """
+
+    action_type: Any
+    name: str
+    type_name: str
+    send_goal: Service
+    cancel_goal: Service
+    get_result: Service
+    feedback_topic: str
+    status_topic: str
+
+
+@dataclass(frozen=True, slots=True)
+class TopicQos:
+    """The QoS of a topic. Topics are reliable here.
+
+    Attributes:
+        depth: how many messages are kept for a slow reader; the oldest are dropped.
+        latched: whether a new subscription gets the messages that are kept (transient local).
+    """
+
+    depth: int = 10
+    latched: bool = False
 
 
 class RequestId(Protocol):
@@ -163,6 +209,39 @@ class ClientPort(Protocol):
         """Destroy the client; idempotent."""
 
 
+class PublisherPort(Protocol):
+    """One rcl publisher. Call its methods on the loop's thread; every one returns at once."""
+
+    def publish(self, message: Any) -> None:
+        """Publish a message. It is converted at once, so it may be changed afterwards.
+
+        Raises:
+            PortDestroyed: the publisher was destroyed.
+            ContextShutdown: the node is down.
+        """
+
+    def subscriptions(self) -> int:
+        """Return how many subscriptions are matched; raises as `publish`."""
+
+    def close(self) -> None:
+        """Destroy the publisher; idempotent."""
+
+
+class SubscriptionPort(Protocol):
+    """One rcl subscription. Call its methods on the loop's thread; every one returns at once."""
+
+    def publishers(self) -> int:
+        """Return how many publishers are matched.
+
+        Raises:
+            PortDestroyed: the subscription was destroyed.
+            ContextShutdown: the node is down.
+        """
+
+    def close(self) -> None:
+        """Stop delivering, and destroy the subscription; idempotent."""
+
+
 class NodePort(Protocol):
     """One node, with its executor thread and its bridge.
 
@@ -219,6 +298,47 @@ class NodePort(Protocol):
 
     def open_service(self, service: Service, deliver: DeliverRequest) -> ServicePort:
         """Create a service that passes its requests to ``deliver``; raises as `open_client`."""
+
+    def describe_action(self, action_type: Any, action_name: str) -> Action:
+        """Check and resolve an action. From any thread.
+
+        Raises:
+            TypeError, ValueError: the type does not exist.
+            InvalidServiceName: ROS does not allow the name.
+            ContextShutdown: the node is down.
+        """
+
+    def make_message(self, message_type: Any, value: Any) -> Any:
+        """Return a message of a type, from a message, a mapping or None. Any thread.
+
+        Raises:
+            TypeError, ValueError: it does not fit.
+        """
+
+    def deserialize(self, message_type: Any, data: bytes) -> Any:
+        """Return the message in the bytes that a raw subscription delivers.
+
+        Raises:
+            ValueError: it cannot be read.
+        """
+
+    def open_publisher(self, msg_type: Any, topic_name: str, qos: TopicQos) -> PublisherPort:
+        """Create a publisher; raises as `open_client`."""
+
+    def open_subscription(
+        self,
+        msg_type: Any,
+        topic_name: str,
+        qos: TopicQos,
+        deliver: DeliverMessage,
+        *,
+        raw: bool = False,
+    ) -> SubscriptionPort:
+        """Create a subscription that passes its messages to ``deliver``, as bytes if ``raw``.
+
+        Raises:
+            Exception: as `open_client`.
+        """
 
     def count_servers(self, service: Service) -> int:
         """Return how many servers have the service's name, whatever their type and QoS. Cheap.

@@ -6,18 +6,20 @@ import asyncio
 import logging
 import sys
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 
-from rosasync._core.ports import Deliver, DeliverRequest
+from rosasync._core.ports import Deliver, DeliverMessage, DeliverRequest
 from rosasync._ros.busy_poll import BusyPoll
 from rosasync._ros.failures import RclpyError, check_up, explain, is_destroyed
 from rosasync._ros.rcl import Rcl
 from rosasync._ros.responder import Responder
 from rosasync._ros.services import make_service, qos_of, take_requests
 from rosasync._ros.signals import Signal, Signals
+from rosasync._ros.topics import DirectSubscription, take_messages
 from rosasync.errors import RosasyncError
 
 __all__ = ["DESTROY_DELAY", "DirectBridge", "DirectCallbackGroup"]
@@ -67,10 +69,11 @@ class DirectBridge:
         self._group = DirectCallbackGroup()
         self._clients: Signals[DirectClient] = Signals(loop, _take_responses)
         self._services: Signals[DirectService] = Signals(loop, _take_requests)
+        self._subscriptions: Signals[DirectSubscription] = Signals(loop, take_messages)
         self._poll = BusyPoll(loop, busy_poll) if busy_poll else None
         self._loop = loop
-        # Clients to destroy, with the timers that do so after DESTROY_DELAY, or `close` sooner.
-        self._retired: dict[Any, asyncio.TimerHandle] = {}
+        # What destroys an entity, with its timer that runs after DESTROY_DELAY, or `close` sooner.
+        self._retired: dict[Callable[[], object], asyncio.TimerHandle] = {}
 
     def open_client(self, srv_type: Any, srv_name: str, qos: Any, deliver: Deliver) -> DirectClient:
         """Create a client that passes its responses to ``deliver`` on the loop's thread."""
@@ -98,6 +101,21 @@ class DirectBridge:
             self._node.destroy_service(service)
             raise
 
+    def open_subscription(
+        self, msg_type: Any, topic_name: str, qos: Any, deliver: DeliverMessage, raw: bool
+    ) -> DirectSubscription:
+        """Create a subscription that passes its messages to ``deliver`` on the loop's thread."""
+        subscription = self._node.create_subscription(
+            msg_type, topic_name, _ignore_message, qos, callback_group=self._group, raw=raw
+        )
+        try:
+            return DirectSubscription(
+                self._node, subscription, self._rcl, self._subscriptions, deliver, self._retire
+            )
+        except BaseException:
+            self._node.destroy_subscription(subscription)
+            raise
+
     def refuse(self) -> None:
         """Make every later send fail, because the context was shut down.
 
@@ -107,26 +125,29 @@ class DirectBridge:
             client.refuse()
 
     def close(self) -> None:
-        """Destroy the clients and services that are left, then close the eventfds."""
+        """Destroy what is left, then close the eventfds."""
         for client in self._clients.members:
             client.close()
-        for retired in tuple(self._retired):
-            self._destroy(retired)
+        for subscription in self._subscriptions.members:
+            subscription.close()
+        for destroy in tuple(self._retired):
+            self._destroy(destroy)
         self._clients.close()
+        self._subscriptions.close()
         for service in self._services.members:
             service.close()
         self._services.close()
 
-    def _retire(self, client: Any) -> None:
-        """Destroy a client that has stopped signalling, once no thread can be in its listener."""
+    def _retire(self, destroy: Callable[[], object]) -> None:
+        """Destroy an entity that has stopped signalling, once no thread can be in its listener."""
         if self._loop.is_closed():
-            self._node.destroy_client(client)
+            destroy()
         else:
-            self._retired[client] = self._loop.call_later(DESTROY_DELAY, self._destroy, client)
+            self._retired[destroy] = self._loop.call_later(DESTROY_DELAY, self._destroy, destroy)
 
-    def _destroy(self, client: Any) -> None:
-        self._retired.pop(client).cancel()
-        self._node.destroy_client(client)
+    def _destroy(self, destroy: Callable[[], object]) -> None:
+        self._retired.pop(destroy).cancel()
+        destroy()
 
 
 class DirectClient:
@@ -159,7 +180,7 @@ class DirectClient:
         signals: Signals[DirectClient],
         poll: BusyPoll | None,
         deliver: Deliver,
-        retire: Callable[[Any], None],
+        retire: Callable[[Callable[[], object]], None],
     ) -> None:
         self._node = node
         self._client = client
@@ -273,7 +294,7 @@ class DirectClient:
         self._signals.leave(self, self._signal)
         if self._poll is not None:
             self._poll.leave(self)
-        self._retire(self._client)
+        self._retire(partial(self._node.destroy_client, self._client))
 
     def start_signalling(self) -> None:
         """Let responses wake the loop, including those that are queued already."""
@@ -397,3 +418,7 @@ def _report(loop: asyncio.AbstractEventLoop, callback: object, error: Exception)
 
 def _never_called(request: object, response: object) -> None:
     """Never called: no executor takes from a service in a `DirectCallbackGroup`."""
+
+
+def _ignore_message(message: object) -> None:
+    """Never called: no executor takes from a subscription in a `DirectCallbackGroup`."""

@@ -13,10 +13,11 @@ from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 
 from rosasync._core.gateway import LoopGateway
-from rosasync._core.ports import Deliver, DeliverRequest, RequestHeader
+from rosasync._core.ports import Deliver, DeliverMessage, DeliverRequest, RequestHeader
 from rosasync._ros.failures import RclpyError, explain, is_destroyed
 from rosasync._ros.responder import Responder
 from rosasync._ros.services import make_service, qos_of, take_request
+from rosasync._ros.topics import ExecutorSubscription
 from rosasync.errors import RosasyncError, SessionClosed
 
 __all__ = ["ExecutorBridge"]
@@ -39,6 +40,7 @@ class ExecutorBridge:
         self._group = ReentrantCallbackGroup()
         self._clients: dict[ExecutorClient, None] = {}
         self._services: dict[ExecutorService, None] = {}
+        self._subscriptions: dict[ExecutorSubscription, None] = {}
 
     def open_client(
         self, srv_type: Any, srv_name: str, qos: Any, deliver: Deliver
@@ -77,6 +79,20 @@ class ExecutorBridge:
             self._node.executor.wake()
         return opened
 
+    def open_subscription(
+        self, msg_type: Any, topic_name: str, qos: Any, deliver: DeliverMessage, raw: bool
+    ) -> ExecutorSubscription:
+        """Create a subscription that passes its messages to ``deliver`` on the loop's thread."""
+        opened = ExecutorSubscription(self._node, self._gateway, deliver, self._subscriptions.pop)
+        # A group of its own keeps the messages in order in a MultiThreadedExecutor.
+        group = MutuallyExclusiveCallbackGroup()
+        subscription = self._node.create_subscription(
+            msg_type, topic_name, opened.take, qos, callback_group=group, raw=raw
+        )
+        opened.begin(subscription)
+        self._subscriptions[opened] = None
+        return opened
+
     def refuse(self) -> None:
         """Make every later send fail, because the context was shut down.
 
@@ -86,9 +102,11 @@ class ExecutorBridge:
             client.refuse()
 
     def close(self) -> None:
-        """Destroy the clients and services that are left."""
+        """Destroy what is left."""
         for client in tuple(self._clients):
             client.close()
+        for subscription in tuple(self._subscriptions):
+            subscription.close()
         for service in tuple(self._services):
             service.close()
 

@@ -13,7 +13,16 @@ from rclpy.node import Node
 from rosasync._core.ports import PortDestroyed, Service
 from rosasync.errors import ContextShutdown, RosasyncError, UsageError
 
-__all__ = ["RclpyError", "check_up", "explain", "is_destroyed", "is_up", "refusal", "uses_node"]
+__all__ = [
+    "RclpyError",
+    "check_up",
+    "explain",
+    "is_destroyed",
+    "is_up",
+    "refusal",
+    "topic_refusal",
+    "uses_node",
+]
 
 RclpyError = (InvalidHandle, rclpy_implementation.RCLError)
 """What rclpy raises if an entity was destroyed, or if rcl reports an error."""
@@ -50,8 +59,8 @@ def explain(node: Node, handle: Any, error: Exception) -> Exception:
     if not is_up(node):
         return ContextShutdown()
     if is_destroyed(handle):
-        return PortDestroyed("the rclpy client or service was destroyed")
-    return RosasyncError(f"rclpy reports an error of a client or service: {error}")
+        return PortDestroyed("the rclpy entity was destroyed")
+    return RosasyncError(f"rclpy reports an error of an entity: {error}")
 
 
 @contextmanager
@@ -85,4 +94,14 @@ def refusal(node: Node, service: Service, kind: str, error: Exception) -> Except
     return RosasyncError(
         f"{srv_name}: the middleware refused to create the {kind} of type {srv_type}; check the "
         f"name, the QoS and how many entities this process has ({error})"
+    )
+
+
+def topic_refusal(node: Node, topic_name: str, error: Exception) -> Exception:
+    """Return the error to raise after rclpy has failed to create a publisher or subscription."""
+    if not is_up(node):
+        return ContextShutdown()
+    return RosasyncError(
+        f"{topic_name}: the middleware refused the topic; check whether this process uses the name "
+        f"with another type ({error})"
     )

@@ -1,4 +1,4 @@
-"""Checks and resolves service names, types and QoS."""
+"""Checks and resolves the names and types of services and actions."""
 
 from __future__ import annotations
 
@@ -10,13 +10,21 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, qos_profile_services_default
 from rclpy.validate_full_topic_name import validate_full_topic_name
 
-from rosasync._core.ports import Service
+from rosasync._core.ports import Action, Service
+from rosasync._ros.action_types import action_type
 from rosasync._ros.failures import uses_node
 from rosasync._ros.messages import service_type, type_name
 from rosasync.errors import InvalidServiceName
 from rosasync.statistics import ServiceKey
 
-__all__ = ["DEPTH", "DEPTH_WITHOUT_HEARTBEATS", "default_qos", "describe", "resolve_name"]
+__all__ = [
+    "DEPTH",
+    "DEPTH_WITHOUT_HEARTBEATS",
+    "default_qos",
+    "describe",
+    "describe_action",
+    "resolve_name",
+]
 
 DEPTH = 1000
 """History of clients and servers by default. Beside other processes' calls, the ten of rclpy's
@@ -36,6 +44,26 @@ def describe(node: Node, srv_type: Any, srv_name: str, qos: Any) -> Service:
     return Service(srv_class, srv_name, qos, key)
 
 
+def describe_action(node: Node, wanted: Any, action_name: str) -> Action:
+    """Check and resolve an action; see `rosasync._core.ports.NodePort.describe_action`."""
+    action_class = action_type(wanted)
+    # Checked by itself first, so that an error has the name that the caller gave. It is not
+    # remapped: rcl remaps the names of its services and topics.
+    expanded = expand_name(node, action_name, "action")
+    implementation = action_class.Impl
+    prefix = f"{action_name}/_action"
+    return Action(
+        action_class,
+        expanded,
+        type_name(action_class),
+        describe(node, implementation.SendGoalService, f"{prefix}/send_goal", None),
+        describe(node, implementation.CancelGoalService, f"{prefix}/cancel_goal", None),
+        describe(node, implementation.GetResultService, f"{prefix}/get_result", None),
+        f"{prefix}/feedback",
+        f"{prefix}/status",
+    )
+
+
 def default_qos(depth: int = DEPTH) -> QoSProfile:
     """Return the service default with another history."""
     qos = QoSProfile(depth=depth)
@@ -51,19 +79,31 @@ def resolve_name(node: Node, srv_name: str) -> str:
         InvalidServiceName: ROS does not allow the name.
         TypeError: not a str.
     """
-    if not isinstance(srv_name, str):
-        raise TypeError(f"a service name must be a str, not {type(srv_name).__name__}")
-    if not srv_name.isascii():
+    name = expand_name(node, srv_name, "service")
+    with uses_node(node):
+        return str(node.resolve_service_name(name))
+
+
+def expand_name(node: Node, given: str, kind: str) -> str:
+    """Return the full name of a service or an action, not remapped.
+
+    Raises:
+        InvalidServiceName: ROS does not allow the name.
+        TypeError: not a str.
+    """
+    if not isinstance(given, str):
+        raise TypeError(f"the name of a {kind} must be a str, not {type(given).__name__}")
+    if not given.isascii():
         # rclpy's bindings raise a TypeError for what cannot be encoded, such as lone surrogates.
         raise InvalidServiceName(
-            f"{srv_name!r} is not a valid service name: it may have letters from a to z, digits, "
+            f"{given!r} is not a valid {kind} name: it may have letters from a to z, digits, "
             "underscores, slashes and ~ at its start"
         )
     try:
         with uses_node(node):
-            name = expand_topic_name(srv_name, node.get_name(), node.get_namespace())
+            name = expand_topic_name(given, node.get_name(), node.get_namespace())
             validate_full_topic_name(name, is_service=True)
-            return str(node.resolve_service_name(srv_name))
     except (InvalidServiceNameException, InvalidTopicNameException, ValueError) as error:
         reason = str(error).strip().replace("\n", " ")
-        raise InvalidServiceName(f"{srv_name!r} is not a valid service name: {reason}") from None
+        raise InvalidServiceName(f"{given!r} is not a valid {kind} name: {reason}") from None
+    return str(name)

@@ -14,19 +14,32 @@ from rclpy.exceptions import InvalidHandle, InvalidNodeNameException
 from rclpy.executors import Executor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, qos_profile_system_default
+from rclpy.serialization import deserialize_message
 from rclpy.service_introspection import ServiceIntrospectionState
 from rclpy.signals import SignalHandlerOptions
 
 from rosasync._core.gateway import LoopGateway
-from rosasync._core.ports import ClientPort, Deliver, DeliverRequest, Service, ServicePort
-from rosasync._ros import discovery, names, profile, rcl
+from rosasync._core.ports import (
+    Action,
+    ClientPort,
+    Deliver,
+    DeliverMessage,
+    DeliverRequest,
+    PublisherPort,
+    Service,
+    ServicePort,
+    SubscriptionPort,
+    TopicQos,
+)
+from rosasync._ros import action_types, discovery, names, profile, rcl
 from rosasync._ros.direct_bridge import DirectBridge
 from rosasync._ros.executor_bridge import ExecutorBridge
 from rosasync._ros.executor_thread import ExecutorThread, ThreadUser, executor_thread_of
-from rosasync._ros.failures import RclpyError, check_up, is_up, refusal
+from rosasync._ros.failures import RclpyError, check_up, is_up, refusal, topic_refusal
 from rosasync._ros.graph import GraphQueries, GraphWaitable
-from rosasync._ros.messages import request_message
+from rosasync._ros.messages import request_message, type_name
 from rosasync._ros.shared_memory import check_ports
+from rosasync._ros.topics import Publisher, qos_profile
 from rosasync.errors import RosasyncError, UsageError
 from rosasync.options import SessionOptions
 
@@ -91,6 +104,7 @@ class RosNode:
         self._user_executor: Executor | None = None
         self._waitable: GraphWaitable | None = None
         self._bridge: Bridge | None = None
+        self._publishers: dict[Publisher, None] = {}
         try:
             self._open(options)
         except BaseException:
@@ -157,6 +171,50 @@ class RosNode:
         except RclpyError as error:
             raise refusal(self._node, service, "service", error) from error
 
+    def describe_action(self, action_type: Any, action_name: str) -> Action:
+        """Check and resolve an action."""
+        return names.describe_action(self._node, action_type, action_name)
+
+    def make_message(self, message_type: Any, value: Any) -> Any:
+        """Return a message of a type, from a message, a mapping or None."""
+        return action_types.make_message(message_type, value)
+
+    def deserialize(self, message_type: Any, data: bytes) -> Any:
+        """Return the message in the bytes that a raw subscription delivers."""
+        try:
+            return deserialize_message(data, message_type)
+        except RuntimeError as error:
+            raise ValueError(
+                f"a message of {type_name(message_type)} cannot be read: {error}"
+            ) from error
+
+    def open_publisher(self, msg_type: Any, topic_name: str, qos: TopicQos) -> PublisherPort:
+        """Create a publisher."""
+        try:
+            publisher = self._node.create_publisher(msg_type, topic_name, qos_profile(qos))
+        except RclpyError as error:
+            raise topic_refusal(self._node, topic_name, error) from error
+        opened = Publisher(self._node, publisher, self._publishers.pop)
+        self._publishers[opened] = None
+        return opened
+
+    def open_subscription(
+        self,
+        msg_type: Any,
+        topic_name: str,
+        qos: TopicQos,
+        deliver: DeliverMessage,
+        *,
+        raw: bool = False,
+    ) -> SubscriptionPort:
+        """Create a subscription that passes its messages to ``deliver``."""
+        try:
+            return self._opened.open_subscription(
+                msg_type, topic_name, qos_profile(qos), deliver, raw
+            )
+        except RclpyError as error:
+            raise topic_refusal(self._node, topic_name, error) from error
+
     def count_servers(self, service: Service) -> int:
         """Return how many servers have the name, whatever their type."""
         return self._graph.count_servers(service)
@@ -203,6 +261,8 @@ class RosNode:
             self._waitable.close()
         if self._bridge is not None:
             self._bridge.close()
+        for publisher in tuple(self._publishers):
+            publisher.close()
         if self._thread is not None:
             self._thread.close()
         # Drop the reference: a MultiThreadedExecutor ends its threads when it is collected.

@@ -32,6 +32,8 @@ class Rcl:
         self._on_response.argtypes = pointers
         self._on_request = rcl.rcl_service_set_on_new_request_callback
         self._on_request.argtypes = pointers
+        self._on_message = rcl.rcl_subscription_set_on_new_message_callback
+        self._on_message.argtypes = pointers
         self._graph = rcl.rcl_node_get_graph_guard_condition
         self._graph.argtypes = [ctypes.c_void_p]
         self._graph.restype = ctypes.c_void_p
@@ -53,6 +55,14 @@ class Rcl:
             False if the middleware does not support it or the service was destroyed.
         """
         return _set_callback(self._on_request, service, self._signal, fd)
+
+    def signal_messages(self, subscription: Any, fd: int | None) -> bool:
+        """Make an eventfd count the subscription's new messages; None ends it.
+
+        Returns:
+            False if the middleware does not support it or the subscription was destroyed.
+        """
+        return _set_callback(self._on_message, subscription, self._signal, fd)
 
     def add_graph_guard(self, node: Any, wait_set: Any) -> int | None:
         """Add the node's graph guard condition to a wait set.

@@ -25,7 +25,16 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from rosasync._core.gateway import LoopGateway
-from rosasync._core.ports import Deliver, DeliverRequest, Service, Undeliverable
+from rosasync._core.ports import (
+    Action,
+    Deliver,
+    DeliverMessage,
+    DeliverRequest,
+    Service,
+    TopicQos,
+    Undeliverable,
+)
+from rosasync._ros.action_types import action_type, make_message
 from rosasync._ros.messages import request_message, service_type, type_name
 from rosasync.errors import InvalidServiceName
 from rosasync.session import Session
@@ -36,8 +45,10 @@ __all__ = [
     "FakeClient",
     "FakeGraph",
     "FakeNode",
+    "FakePublisher",
     "FakeServer",
     "FakeService",
+    "FakeSubscription",
 ]
 
 logger = logging.getLogger("rosasync")
@@ -191,6 +202,8 @@ class FakeGraph:
         self.graph_events = graph_events
         self.servers: list[FakeServer] = []
         self.nodes: list[FakeNode] = []
+        self.publishers: list[FakePublisher] = []
+        self.subscriptions: list[FakeSubscription] = []
         self.delay = 0.0
         self.holding = False
         self.dropping_requests = False
@@ -314,13 +327,39 @@ class FakeNode:
         """Return a message of the request type."""
         return request_message(srv_type, request)
 
-    def _resolve(self, srv_name: str) -> str:
+    def describe_action(self, wanted: Any, action_name: str) -> Action:
+        """Check and resolve an action."""
+        action_class = action_type(wanted)
+        name = self._resolve(action_name, "action")
+        implementation = action_class.Impl
+        return Action(
+            action_class,
+            name,
+            type_name(action_class),
+            self.describe(implementation.SendGoalService, f"{name}/_action/send_goal", None),
+            self.describe(implementation.CancelGoalService, f"{name}/_action/cancel_goal", None),
+            self.describe(implementation.GetResultService, f"{name}/_action/get_result", None),
+            f"{name}/_action/feedback",
+            f"{name}/_action/status",
+        )
+
+    def make_message(self, message_type: Any, value: Any) -> Any:
+        """Return a message of a type, from a message, a mapping or None."""
+        return make_message(message_type, value)
+
+    def deserialize(self, message_type: Any, data: bytes) -> Any:
+        """Return a copy of the message that was published."""
+        if isinstance(data, _Serialized) and isinstance(data.message, message_type):
+            return deepcopy(data.message)
+        raise ValueError(f"not a message of {type_name(message_type)}")
+
+    def _resolve(self, given: str, kind: str = "service") -> str:
         """Return the name with a leading slash, that of a private name after the node's."""
-        if not isinstance(srv_name, str):
-            raise TypeError(f"a service name must be a str, not {type(srv_name).__name__}")
-        name = f"{self.name}/{srv_name[2:]}" if srv_name.startswith("~/") else srv_name
+        if not isinstance(given, str):
+            raise TypeError(f"the name of a {kind} must be a str, not {type(given).__name__}")
+        name = f"{self.name}/{given[2:]}" if given.startswith("~/") else given
         if NAME.fullmatch(name) is None:
-            raise InvalidServiceName(f"{srv_name!r} is not a valid service name")
+            raise InvalidServiceName(f"{given!r} is not a valid {kind} name")
         return name if name.startswith("/") else f"/{name}"
 
     def open_client(self, service: Service, deliver: Deliver) -> FakeClient:
@@ -336,6 +375,24 @@ class FakeNode:
         self.graph.servers.append(opened)
         self.graph.changed()
         return opened
+
+    def open_publisher(self, msg_type: Any, topic_name: str, qos: TopicQos) -> FakePublisher:
+        """Create a publisher."""
+        return FakePublisher(self, msg_type, self._resolve(topic_name, "topic"), qos)
+
+    def open_subscription(
+        self,
+        msg_type: Any,
+        topic_name: str,
+        qos: TopicQos,
+        deliver: DeliverMessage,
+        *,
+        raw: bool = False,
+    ) -> FakeSubscription:
+        """Create a subscription that passes its messages to ``deliver``."""
+        return FakeSubscription(
+            self, msg_type, self._resolve(topic_name, "topic"), qos, deliver, raw
+        )
 
     def count_servers(self, service: Service) -> int:
         """Return how many servers have this name."""
@@ -439,3 +496,122 @@ class FakeClient:
             self.closed = True
             self.node.clients.remove(self)
             self.node.graph.changed_soon()
+
+
+class FakePublisher:
+    """A publisher of a `FakeNode`: a `rosasync._core.ports.PublisherPort`.
+
+    Attributes:
+        published: copies of the messages published, in order.
+    """
+
+    def __init__(self, node: FakeNode, msg_type: Any, topic_name: str, qos: TopicQos) -> None:
+        self.node = node
+        self.msg_type = msg_type
+        self.topic_name = topic_name
+        self.closed = False
+        self.published: list[Any] = []
+        self._kept: deque[Any] = deque(maxlen=qos.depth if qos.latched else 0)
+        node.graph.publishers.append(self)
+        for subscription in self._matched():
+            subscription.catch_up(self)
+
+    @property
+    def kept(self) -> tuple[Any, ...]:
+        """The messages that a new latched subscription gets."""
+        return tuple(self._kept)
+
+    def publish(self, message: Any) -> None:
+        """Send a copy of a message to every subscription of the topic."""
+        copy = deepcopy(message)
+        self.published.append(copy)
+        self._kept.append(copy)
+        for subscription in self._matched():
+            subscription.receive(copy)
+
+    def subscriptions(self) -> int:
+        """Return how many subscriptions the topic has."""
+        return len(self._matched())
+
+    def close(self) -> None:
+        """Leave the graph; idempotent."""
+        if not self.closed:
+            self.closed = True
+            self.node.graph.publishers.remove(self)
+
+    def _matched(self) -> list[FakeSubscription]:
+        return [each for each in self.node.graph.subscriptions if each.matches(self)]
+
+
+class FakeSubscription:
+    """A subscription of a `FakeNode`: a `rosasync._core.ports.SubscriptionPort`."""
+
+    def __init__(
+        self,
+        node: FakeNode,
+        msg_type: Any,
+        topic_name: str,
+        qos: TopicQos,
+        deliver: DeliverMessage,
+        raw: bool,
+    ) -> None:
+        self.node = node
+        self.msg_type = msg_type
+        self.topic_name = topic_name
+        self.closed = False
+        self._qos = qos
+        self._deliver = deliver
+        self._raw = raw
+        self._queue: deque[Any] = deque(maxlen=qos.depth)
+        self._loop = asyncio.get_running_loop()
+        node.graph.subscriptions.append(self)
+        for publisher in node.graph.publishers:
+            self.catch_up(publisher)
+
+    def matches(self, publisher: FakePublisher) -> bool:
+        """Return whether a publisher is of this topic and type."""
+        return (publisher.topic_name, publisher.msg_type) == (self.topic_name, self.msg_type)
+
+    def catch_up(self, publisher: FakePublisher) -> None:
+        """Receive what a publisher has kept, if this subscription is latched."""
+        if self._qos.latched and self.matches(publisher):
+            for message in publisher.kept:
+                self.receive(message)
+
+    def receive(self, message: Any) -> None:
+        """Queue a message and deliver it in the next turn of the loop; the oldest may be lost."""
+        if not self._queue:
+            self._loop.call_soon(self._deliver_queued)
+        self._queue.append(message)
+
+    def publishers(self) -> int:
+        """Return how many publishers the topic has."""
+        return sum(self.matches(publisher) for publisher in self.node.graph.publishers)
+
+    def close(self) -> None:
+        """Leave the graph; idempotent."""
+        if not self.closed:
+            self.closed = True
+            self._queue.clear()
+            self.node.graph.subscriptions.remove(self)
+
+    def _deliver_queued(self) -> None:
+        messages = tuple(self._queue)
+        self._queue.clear()
+        for message in messages:
+            if not self.closed:
+                self._deliver(_Serialized.of(message) if self._raw else deepcopy(message))
+
+
+class _Serialized(bytes):
+    """What stands for a serialized message: its head, as far as rosasync reads it, and itself."""
+
+    message: Any
+
+    @classmethod
+    def of(cls, message: Any) -> _Serialized:
+        """Serialize a message, with the UUID of its goal where the middleware has it."""
+        goal_id = getattr(message, "goal_id", None)
+        serialized = cls(b"\0\1\0\0" + (b"" if goal_id is None else bytes(goal_id.uuid)))
+        serialized.message = message
+        return serialized

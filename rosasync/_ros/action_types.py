@@ -1,0 +1,98 @@
+"""Action types by their names, and the messages of actions. Needs no rclpy."""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import importlib
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from rosasync._ros.messages import to_message, type_name
+
+__all__ = ["action_type", "make_message"]
+
+_ACTION_NAME = re.compile(r"([a-z]\w*)/action/([a-z]\w*)", re.ASCII | re.IGNORECASE)
+
+_SHAPE = ("Goal", "Result", "Feedback", "Impl")
+
+
+def action_type(wanted: type[Any] | str) -> type[Any]:
+    """Resolve an action class from a class or a name.
+
+    Args:
+        wanted: an action class, or its name, ``"test_msgs/action/Fibonacci"``.
+
+    Raises:
+        TypeError: neither an action class nor a string.
+        ValueError: the name is malformed, or no such action is installed.
+    """
+    if isinstance(wanted, str):
+        return _action_named(wanted)
+    if not isinstance(wanted, type):
+        raise TypeError(
+            "expected an action class, or its name such as 'nav2_msgs/action/NavigateToPose', "
+            f"got {type(wanted).__name__}"
+        )
+    if not _is_action(wanted):
+        raise TypeError(
+            f"{type_name(wanted)} is not an action: it has no Goal, Result and Feedback"
+        )
+    return wanted
+
+
+def make_message(message_type: type[Any], value: object) -> Any:
+    """Return a message of a type.
+
+    Args:
+        message_type: the class.
+        value: a message, returned as it is; a mapping of its fields, as in `to_message`; or None
+            for an empty one.
+
+    Raises:
+        TypeError: the value is anything else, or that of a field is of the wrong kind.
+        ValueError: no such field, or a value out of its range.
+    """
+    if isinstance(value, message_type):
+        return value
+    if value is None:
+        return message_type()
+    if isinstance(value, Mapping):
+        return to_message(message_type, value)
+    given = f"the class {type_name(value)}" if isinstance(value, type) else type_name(type(value))
+    raise TypeError(f"expected {type_name(message_type)}, got {given}")
+
+
+def _is_action(candidate: object) -> bool:
+    return isinstance(candidate, type) and all(
+        isinstance(getattr(candidate, name, None), type) for name in _SHAPE
+    )
+
+
+@functools.cache
+def _action_named(name: str) -> type[Any]:
+    match = _ACTION_NAME.fullmatch(name)
+    if match is None:
+        raise ValueError(
+            f"{name!r} does not name an action type: expected 'package/action/Type', "
+            "such as 'nav2_msgs/action/NavigateToPose'"
+        )
+    package, wanted = match.groups()
+    try:
+        module = importlib.import_module(f"{package}.action")
+    except ModuleNotFoundError as error:
+        if error.name == package:
+            raise ValueError(
+                f"{name!r}: the package {package!r} is not installed for this Python, "
+                "or its workspace is not sourced"
+            ) from None
+        if error.name == f"{package}.action":
+            raise ValueError(f"{name!r}: the package {package!r} has no actions") from None
+        raise
+    actions: dict[str, type[Any]] = {k: v for k, v in vars(module).items() if _is_action(v)}
+    if wanted not in actions:
+        similar = difflib.get_close_matches(wanted, actions, n=1)
+        hint = f"; did you mean '{package}/action/{similar[0]}'?" if similar else ""
+        raise ValueError(f"{name!r}: no such action in {package}{hint}")
+    return actions[wanted]

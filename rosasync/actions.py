@@ -1,0 +1,25 @@
+"""Actions: goals that are never left behind, and servers for them. See `Session.act`."""
+
+from __future__ import annotations
+
+from rosasync._actions.status import GoalStatus
+from rosasync.errors import (
+    CancelRejected,
+    GoalAborted,
+    GoalCanceled,
+    GoalError,
+    GoalRejected,
+    GoalTimeout,
+)
+from rosasync.typing import ActionType
+
+__all__ = [
+    "ActionType",
+    "CancelRejected",
+    "GoalAborted",
+    "GoalCanceled",
+    "GoalError",
+    "GoalRejected",
+    "GoalStatus",
+    "GoalTimeout",
+]
