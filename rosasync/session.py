@@ -107,8 +107,11 @@ class Session:
         state = "closed" if core.closed else f"{core.node.bridge} bridge, {core.pool!r}"
         return f"<Session {core.name!r} {state}>"
 
-    async def __aenter__(self) -> Self:
-        """Open the session in the running loop.
+    async def open(self) -> Self:
+        """Open the session in the running loop, and return it.
+
+        ``async with`` does this, and `aclose` at its end. Open it yourself where no block can span
+        the session's life: in a notebook, or in the start-up hook of a framework.
 
         The first opening in a process imports rclpy, in a thread, while the loop runs other tasks.
         Then it creates the context and the node, which blocks the loop for some tens of
@@ -135,6 +138,10 @@ class Session:
             raise session_closed()
         self._core = Core(self, self._options, self._open_node)
         return self
+
+    async def __aenter__(self) -> Self:
+        """Open the session; see `open`."""
+        return await self.open()
 
     def __enter__(self) -> NoReturn:
         """Raise `UsageError`: a session needs ``async with``."""
@@ -373,8 +380,10 @@ class Session:
         *,
         timeout: Timeout = None,
         qos: QoSProfile | None = None,
-    ) -> None:
-        """Wait until a server of this service is matched.
+    ) -> Literal[True]:
+        """Wait until a server of this service is matched, and return True.
+
+        Unlike rclpy's, it never returns False: it raises instead.
 
         Args:
             srv_type: a service class or its name.
@@ -390,6 +399,7 @@ class Session:
         core = self._use()
         service = core.pool.service(srv_type, srv_name, qos)
         await service.wait_for_server(check_timeout(timeout, core.timeout))
+        return True
 
     def service_is_ready(
         self,
@@ -596,14 +606,18 @@ class ServiceClient(Generic[RequestT, ResponseT]):
         call = service.call(message, seconds, wait, retry, copy=request is not None)
         return start_task(core.loop, call)
 
-    async def wait(self, timeout: Timeout = None) -> None:
-        """Wait until a server is matched; see `Session.wait_for_service`."""
+    async def wait(self, timeout: Timeout = None) -> Literal[True]:
+        """Wait until a server is matched, and return True; see `Session.wait_for_service`."""
         self._core.check_loop()
         await self._service.wait_for_server(check_timeout(timeout, self._timeout))
+        return True
 
 
 def _not_open() -> UsageError:
-    return UsageError("the session is not open: use `async with rosasync.Session(…) as session:`")
+    return UsageError(
+        "the session is not open: use `async with rosasync.Session(…) as session:`, or "
+        "`await session.open()`"
+    )
 
 
 def _load_ros() -> None:

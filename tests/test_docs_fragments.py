@@ -38,8 +38,8 @@ NOT_RUN = {
 }
 """Beginnings of fragments that are only compiled, by `test_docs`, and why."""
 
-SPECIAL = {"lifecycle", "parameters", "testing"}
-"""Pages whose fragments need nodes, or a test around them, which test_testing_plugin has."""
+SPECIAL = {"lifecycle", "notebook", "parameters", "testing"}
+"""Pages whose fragments need nodes, each other, or a test around them (test_testing_plugin)."""
 
 
 def fragments(*pages: Path) -> list[Any]:
@@ -132,3 +132,13 @@ def test_each_reason_is_needed() -> None:
     everything = [code for page in DOCS.rglob("*.md") for code in python_blocks(page)]
     unused = [start for start in NOT_RUN if not any(c.startswith(start) for c in everything)]
     assert not unused
+
+
+async def test_the_cells_of_a_notebook(graph: Graph) -> None:
+    names: dict[str, Any] = {}
+    for code in python_blocks(DOCS / "how-to" / "notebook.md"):
+        await run(code, names)
+    assert names["response"].success
+    assert len(names["answers"]) == 2
+    assert names["seen"] == [True]
+    assert names["session"].closed

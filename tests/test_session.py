@@ -121,7 +121,7 @@ async def test_a_bound_client(session: Session, server: ServerProcess) -> None:
     with pytest.raises(ServiceUnavailable):
         await client.wait(TICK)
     await server.serve("/echo")
-    await client.wait(LIMIT)
+    assert await client.wait(LIMIT) is True
     assert client.ready
     assert answer_to(await client.call(request_of("called"))) == "called"
     assert answer_to(await client.start({"load_namespace": "started"})) == "started"
@@ -166,7 +166,9 @@ async def test_auto_takes_the_direct_bridge(echo: str) -> None:
 
 async def test_opened_in_one_task_and_closed_in_another(bridge: Bridge, echo: str) -> None:
     session = Session("wanderer", bridge=bridge)
-    await asyncio.create_task(session.__aenter__())
+    assert await asyncio.create_task(session.open()) is session
+    with pytest.raises(UsageError, match="only once"):
+        await session.open()
     await asyncio.create_task(check_call(session, echo, "text"))
     await asyncio.create_task(session.aclose())
     assert session.closed
@@ -279,7 +281,7 @@ async def test_ready_or_not(session: Session, server: ServerProcess) -> None:
     waiting = asyncio.create_task(session.wait_for_service(ECHO, "/echo"))
     await asyncio.sleep(0)
     await server.serve("/echo")
-    await waiting
+    assert await waiting is True
     assert session.service_is_ready(ECHO, "/echo")
     await server.stop("/echo")
     await until(lambda: not session.service_is_ready(ECHO, "/echo"))
