@@ -120,18 +120,6 @@ def test_every_error_is_a_rosasync_error_and_calls_tell_what_they_called() -> No
     assert issubclass(rosasync.UsageError, RuntimeError)
 
 
-def test_only_ros_imports_rclpy() -> None:
-    offenders = [
-        f"{file.relative_to(PACKAGE)}:{node.lineno}"
-        for file in PACKAGE.rglob("*.py")
-        if "_ros" not in file.relative_to(PACKAGE).parts
-        and file.relative_to(PACKAGE) != Path("_demo/stock.py")
-        for node in _runtime_imports(ast.parse(file.read_text()))
-        if any(name.partition(".")[0] == "rclpy" for name in _imported(node))
-    ]
-    assert not offenders
-
-
 def test_without_rclpy_it_imports_and_says_what_is_missing() -> None:
     program = """
 import asyncio, sys
@@ -168,24 +156,3 @@ def test_it_is_typed() -> None:
 def _is_empty(module: ModuleType) -> bool:
     source = inspect.getsource(module) if module.__file__ else ""
     return not [node for node in ast.parse(source).body if not isinstance(node, ast.Expr)]
-
-
-def _runtime_imports(tree: ast.Module) -> list[ast.Import | ast.ImportFrom]:
-    """The imports that run, not those under ``if TYPE_CHECKING``."""
-    typing_only = {
-        id(child)
-        for node in ast.walk(tree)
-        if isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING")
-        for child in ast.walk(node)
-    }
-    return [
-        node
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Import | ast.ImportFrom) and id(node) not in typing_only
-    ]
-
-
-def _imported(node: ast.Import | ast.ImportFrom) -> list[str]:
-    if isinstance(node, ast.Import):
-        return [alias.name for alias in node.names]
-    return [node.module or ""]

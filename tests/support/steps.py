@@ -33,7 +33,7 @@ class Victim:
         self.suspensions = 0
         self._target = suspension
         self.moment = moment
-        self.task = asyncio.get_running_loop().create_task(_watched(coroutine, self._suspended))
+        self.task = asyncio.get_running_loop().create_task(_run(coroutine, self._suspended))
 
     def __repr__(self) -> str:
         return f"<Victim await {self._target}, {self.moment}>"
@@ -75,6 +75,11 @@ async def every_victim(
         if not cancelled:
             assert suspension > 0, "the call never waits, so nothing was tested"
             return
+
+
+async def _run(coroutine: Coroutine[Any, Any, T], suspended: Callable[[Any], None]) -> T:
+    # From Python 3.12 on, a task does not take the generator of a `types.coroutine`.
+    return await _watched(coroutine, suspended)
 
 
 @types.coroutine
