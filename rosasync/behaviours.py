@@ -14,12 +14,13 @@ Ticked in the loop, with an ``await`` between ticks, or in a thread of the tree'
 from __future__ import annotations
 
 import contextlib
+import logging
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Generic
 
 from rosasync._core.proxy import AsyncServiceProxy, ProxyState
 from rosasync.errors import UsageError
-from rosasync.options import check_timeout
+from rosasync.options import Retry, check_retry, check_timeout
 from rosasync.typing import RequestT, ResponseT, ServiceType, Timeout
 
 try:
@@ -38,6 +39,8 @@ if TYPE_CHECKING:
 
 __all__ = ["CallService", "FromBlackboard", "FromConstant", "WaitForService"]
 
+logger = logging.getLogger("rosasync")
+
 
 class ServiceBehaviour(Behaviour, Generic[RequestT, ResponseT]):  # type: ignore[misc]
     """The base of both behaviours: holds a proxy from `setup` to `shutdown`."""
@@ -49,11 +52,13 @@ class ServiceBehaviour(Behaviour, Generic[RequestT, ResponseT]):  # type: ignore
         srv_name: str,
         qos: QoSProfile | None,
         session: Session | None,
+        retry: Retry | None = None,
     ) -> None:
         super().__init__(name)
         self.srv_type = srv_type
         self.srv_name = srv_name
         self._qos = qos
+        self._retry = retry
         self._session = session
         self._proxy: AsyncServiceProxy[RequestT, ResponseT] | None = None
 
@@ -74,7 +79,9 @@ class ServiceBehaviour(Behaviour, Generic[RequestT, ResponseT]):  # type: ignore
                 "it session="
             )
         self.shutdown()
-        self._proxy = AsyncServiceProxy(session, self.srv_type, self.srv_name, qos=self._qos)
+        self._proxy = AsyncServiceProxy(
+            session, self.srv_type, self.srv_name, qos=self._qos, retry=self._retry
+        )
 
     def terminate(self, new_status: Status) -> None:
         """Cancel the operation if the behaviour is interrupted."""
@@ -110,6 +117,9 @@ class CallService(ServiceBehaviour[RequestT, ResponseT]):
     the response and the error on the blackboard before it calls, so it never shows the result of an
     earlier run.
 
+    If a function that it was given raises, or a blackboard variable cannot be read or written, the
+    run ends with FAILURE, as with any other error. The tree goes on; the traceback is logged.
+
     Args:
         name: the name of the behaviour.
         srv_type: a service class or its name, ``"std_srvs/srv/SetBool"``.
@@ -127,12 +137,13 @@ class CallService(ServiceBehaviour[RequestT, ResponseT]):
         on_feedback: called with each new feedback message.
         timeout: seconds for the whole call; None for no deadline; if left out, the session's.
         wait: False to fail at once if there is no server.
+        retry: when to send an unanswered request again; only for services that may run twice.
         qos: a ``QoSProfile``; None for the service default.
         session: the session; None to take it from ``tree.setup(session=…)``.
 
     Raises:
         TypeError: both a request and a key for it are given.
-        TypeError, ValueError: the timeout does not fit.
+        TypeError, ValueError: the timeout or retry does not fit.
     """
 
     def __init__(
@@ -154,17 +165,21 @@ class CallService(ServiceBehaviour[RequestT, ResponseT]):
         on_feedback: Callable[[str], object] | None = None,
         timeout: Timeout = ...,
         wait: bool = True,
+        retry: Retry | None = None,
         qos: QoSProfile | None = None,
         session: Session | None = None,
     ) -> None:
-        super().__init__(name, srv_type, srv_name, qos, session)
+        super().__init__(name, srv_type, srv_name, qos, session, retry)
         if request is not None and key_request is not None:
             raise TypeError("give either a request or a key_request, not both")
         check_timeout(timeout, None)
+        if retry is not None:
+            check_retry(retry)
         self._request: Any = request
         self._timeout = timeout
         self._wait = wait
-        self._request_error: Exception | None = None
+        # Why the run has failed, if its call could not be started.
+        self._start_error: Exception | None = None
         self._on_response = on_response
         self._on_error = on_error
         self._on_feedback = on_feedback
@@ -193,34 +208,40 @@ class CallService(ServiceBehaviour[RequestT, ResponseT]):
         """Start the call."""
         proxy = self.proxy
         proxy.stop_call()
-        self._request_error = None
-        self._unset(self._key_response)
-        self._unset(self._key_error)
-        request = self._request() if callable(self._request) else self._request
+        self._start_error = None
         try:
-            if self._key_request is not None:
-                request = self.blackboard.get(self._key_request)
-            proxy.call_service(request, self._timeout, wait=self._wait)
-        except (KeyError, TypeError, ValueError) as error:
-            self._request_error = error
-            self.logger.error(f"{self.qualified_name}: no request for {self.srv_name}: {error}")
-        else:
+            self._unset(self._key_response)
+            self._unset(self._key_error)
+            proxy.call_service(self._take_request(), self._timeout, wait=self._wait)
             self._set_feedback(f"calling {self.srv_name}")
+        except Exception as error:
+            # The call may be out, if its feedback has failed.
+            proxy.stop_call()
+            self._start_error = error
+            # That a blackboard variable does not exist yet is usual, and may recur in every tick.
+            self._log("the call was not made", error, traceback=self._key_request is None)
 
     def update(self) -> Status:
         """Return the status of the call."""
         proxy = self.proxy
+        if self._start_error is not None:
+            return self._failed(self._start_error)
         state = proxy.get_state()
         if state is ProxyState.RUNNING:
             return Status.RUNNING
-        if self._request_error is not None:
-            return self._failed(self._request_error)
         if state is ProxyState.RESPONSE_READY:
-            return self._answered(proxy.get_response())
-        for error in proxy.get_errors():
-            return self._failed(error)
-        self._set_feedback(f"{self.srv_name}: aborted")
-        return Status.FAILURE
+            try:
+                return self._answered(proxy.get_response())
+            except Exception as error:
+                self._log("the response was not handled", error)
+                return self._failed(error)
+        errors = proxy.get_errors()
+        return self._failed(errors[0] if errors else None)
+
+    def _take_request(self) -> Any:
+        if self._key_request is not None:
+            return self.blackboard.get(self._key_request)
+        return self._request() if callable(self._request) else self._request
 
     def _answered(self, response: ResponseT | None) -> Status:
         # Only a bool: a number 0 often means that there was no error.
@@ -235,11 +256,26 @@ class CallService(ServiceBehaviour[RequestT, ResponseT]):
             return Status.FAILURE if unsuccessful else Status.SUCCESS
         return status
 
-    def _failed(self, error: Exception) -> Status:
-        self._set_feedback(str(error))
-        self._set(self._key_error, error)
-        status = None if self._on_error is None else self._on_error(error)
+    def _failed(self, error: Exception | None) -> Status:
+        """Report the error of the run, None if it was aborted; return the status to end with."""
+        status = None
+        try:
+            if error is not None:
+                self._set(self._key_error, error)
+            self._set_feedback(f"{self.srv_name}: aborted" if error is None else str(error))
+            if self._on_error is not None and error is not None:
+                status = self._on_error(error)
+        except Exception as later:
+            later.__context__ = later.__context__ or error
+            self._log("the error was not handled", later)
+            self.feedback_message = str(later)
+            with contextlib.suppress(Exception):
+                self._set(self._key_error, later)
         return Status.FAILURE if status is None else status
+
+    def _log(self, what: str, error: Exception, *, traceback: bool = True) -> None:
+        shown = error if traceback else None
+        logger.error("%s: %s: %r", self.qualified_name, what, error, exc_info=shown)
 
     def _set_feedback(self, message: str) -> None:
         self.feedback_message = message

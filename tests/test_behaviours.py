@@ -28,6 +28,7 @@ from rosasync import (
     SessionClosed,
     UsageError,
 )
+from rosasync import Retry as Repeat
 from rosasync.behaviours import CallService, FromBlackboard, FromConstant, WaitForService
 from rosasync.testing import FakeGraph
 from tests.support.checks import assert_clean
@@ -215,6 +216,16 @@ class TestOutcomes:
             leaf.proxy.stop_call()
             assert await ticked(leaf) is Status.FAILURE
         assert leaf.feedback_message == "/echo: aborted"
+
+    async def test_a_retry_sends_again(self, graph: FakeGraph, fake_session: Session) -> None:
+        leaf = CallService("leaf", ECHO, NAME, retry=Repeat(after=TICK))
+        ready(leaf, fake_session)
+        with graph.drop_requests():
+            leaf.tick_once()
+            await until(lambda: fake_session.pool.statistics().in_flight)
+        assert await ticked(leaf) is Status.SUCCESS
+        with pytest.raises(TypeError, match="retry"):
+            CallService("leaf", ECHO, NAME, retry=3)  # type: ignore[arg-type]
 
     async def test_feedback_goes_to_the_callback(self, fake_session: Session) -> None:
         messages: list[str] = []
@@ -406,6 +417,66 @@ class TestHalting:
         assert await ticked(leaf) is Status.SUCCESS
 
 
+def divide(*_: Any) -> Any:
+    return 1 // 0
+
+
+class TestFunctionsThatRaise:
+    """They fail the leaf, with the error on its key; the tree goes on."""
+
+    @pytest.mark.parametrize("function", ["request", "on_response", "on_feedback"])
+    async def test_the_leaf_fails_with_the_error_on_its_key(
+        self, fake_session: Session, caplog: pytest.LogCaptureFixture, function: str
+    ) -> None:
+        errors: list[Exception] = []
+        options: dict[str, Any] = {function: divide}
+        leaf = CallService("leaf", ECHO, NAME, key_error="error", on_error=errors.append, **options)
+        assert await ticked(ready(leaf, fake_session)) is Status.FAILURE
+        assert isinstance(blackboard("error").error, ZeroDivisionError)
+        assert "by zero" in leaf.feedback_message
+        if function != "on_feedback":
+            assert [type(error) for error in errors] == [ZeroDivisionError]
+        assert "in divide" in caplog.text
+        await until(lambda: not fake_session.pool.statistics().in_flight)
+        assert fake_session.pool.statistics().completed == (function == "on_response")
+
+    async def test_the_error_hook_itself(
+        self, fake_session: Session, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        leaf = CallService(
+            *("leaf", ECHO, "/absent"), wait=False, on_error=divide, key_error="error"
+        )
+        assert await ticked(ready(leaf, fake_session)) is Status.FAILURE
+        error = blackboard("error").error
+        assert isinstance(error, ZeroDivisionError)
+        assert isinstance(error.__context__, ServiceUnavailable)
+        assert "in divide" in caplog.text
+
+    async def test_the_error_hook_may_save_a_run(self, fake_session: Session) -> None:
+        leaf = CallService("leaf", ECHO, NAME, divide, on_error=lambda _: Status.SUCCESS)
+        assert await ticked(ready(leaf, fake_session)) is Status.SUCCESS
+
+    async def test_a_variable_that_cannot_be_written(self, fake_session: Session) -> None:
+        leaf = CallService(*("leaf", ECHO, NAME), key_response="absent.answer", key_error="error")
+        assert await ticked(ready(leaf, fake_session)) is Status.FAILURE
+        assert isinstance(blackboard("error").error, KeyError)
+
+    async def test_the_next_run_begins_anew(self, fake_session: Session) -> None:
+        board = blackboard("error")
+        requests = iter([divide, lambda: request_of("a")])
+        leaf = CallService("leaf", ECHO, NAME, lambda: next(requests)(), key_error="error")
+        assert await ticked(ready(leaf, fake_session)) is Status.FAILURE
+        assert await ticked(leaf) is Status.SUCCESS
+        assert not board.exists("error")
+
+    async def test_in_a_tree_the_others_are_ticked(self, fake_session: Session) -> None:
+        broken = CallService("broken", ECHO, NAME, on_response=divide)
+        spare = CallService("spare", ECHO, NAME)
+        root = py_trees.composites.Selector("root", memory=True, children=[broken, spare])
+        assert await ticked(ready(root, fake_session)) is Status.SUCCESS
+        assert spare.status is Status.SUCCESS
+
+
 class TestSetup:
     """Setup never blocks, and rejects wrong arguments before the first tick."""
 
@@ -452,11 +523,6 @@ class TestSetup:
             CallService("a", ECHO, NAME, timeout=-1.0)
         with pytest.raises(ValueError, match="negative"):
             WaitForService("a", ECHO, NAME, timeout=-1.0)
-
-    async def test_what_a_request_function_raises_is_raised(self, fake_session: Session) -> None:
-        leaf = ready(CallService("a", ECHO, NAME, lambda: 1 // 0), fake_session)
-        with pytest.raises(ZeroDivisionError):
-            leaf.tick_once()
 
     async def test_shutdown_cancels_and_setup_begins_anew(
         self, graph: FakeGraph, fake_session: Session

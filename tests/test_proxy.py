@@ -21,6 +21,7 @@ from rosasync import (
     PoolFull,
     ProxyState,
     ResponseTimeout,
+    Retry,
     ServerGone,
     ServiceUnavailable,
     Session,
@@ -288,6 +289,21 @@ async def test_without_waiting_an_absent_server_ends_the_call_at_once() -> None:
         stage.proxy.call_service(wait=False)
         assert await settled(stage.proxy) is TIMEOUT
         assert [type(error) for error in stage.proxy.get_errors()] == [ServiceUnavailable]
+
+
+async def test_a_retry_sends_again() -> None:
+    graph = FakeGraph()
+    graph.serve(ECHO, "/echo", lambda request: f"to {request.load_namespace}")
+    async with graph.session() as session:
+        proxy = AsyncServiceProxy(session, ECHO, "/echo", retry=Retry(after=TICK))
+        with graph.drop_requests():
+            proxy.call_service(request_of("a"))
+            await until(lambda: session.pool.statistics().in_flight)
+        await until(lambda: proxy.get_state() is not RUNNING)
+        assert proxy.get_response() == "to a"
+        assert session.pool.statistics().retried == 1
+        with pytest.raises(TypeError, match="retry"):
+            AsyncServiceProxy(session, ECHO, "/echo", retry=3)  # type: ignore[arg-type]
 
 
 async def test_a_full_pool_is_an_error() -> None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Generic, cast
 
 from rosasync._core.aio import start_task
 from rosasync.errors import SessionClosed, UsageError
-from rosasync.options import check_timeout
+from rosasync.options import Retry, check_retry, check_timeout
 from rosasync.typing import RequestT, ResponseT, ServiceType, Timeout
 
 if TYPE_CHECKING:
@@ -83,9 +83,10 @@ class AsyncServiceProxy(Generic[RequestT, ResponseT]):
         srv_type: a service class or its name, ``"std_srvs/srv/SetBool"``.
         srv_name: the service's name.
         qos: a ``QoSProfile``; None for the service default.
+        retry: when to send an unanswered request again; only for services that may run twice.
 
     Raises:
-        TypeError, ValueError: the service type does not exist, or the QoS is not a ``QoSProfile``.
+        TypeError, ValueError: the service type does not exist, or QoS or retry does not fit.
         InvalidServiceName: ROS does not allow the name.
         UsageError: the session is not open yet.
         SessionClosed: the session is closed.
@@ -102,6 +103,7 @@ class AsyncServiceProxy(Generic[RequestT, ResponseT]):
         "_gateway",
         "_operation",
         "_pool",
+        "_retry",
         "_service",
         "_timeout",
         "_working",
@@ -114,13 +116,17 @@ class AsyncServiceProxy(Generic[RequestT, ResponseT]):
         srv_name: str,
         *,
         qos: QoSProfile | None = None,
+        retry: Retry | None = None,
     ) -> None:
         core = session.core
         core.gateway.check_open()
+        if retry is not None:
+            check_retry(retry)
         self._gateway = core.gateway
         self._pool = core.pool
         self._arguments = core.arguments
         self._timeout = core.timeout
+        self._retry = retry
         self._service = core.arguments.service(srv_type, srv_name, qos)
         self._operation = _Operation(ProxyState.IDLE)
         self._working: _Operation | None = None
@@ -276,7 +282,7 @@ class AsyncServiceProxy(Generic[RequestT, ResponseT]):
             await service.wait_for_server(operation.time_left())
             return ProxyState.SERVICE_AVAILABLE, None
         response = await service.call(
-            operation.request, operation.time_left(), operation.wait, copy=True
+            operation.request, operation.time_left(), operation.wait, self._retry, copy=True
         )
         return ProxyState.RESPONSE_READY, response
 
