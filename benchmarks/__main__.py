@@ -108,28 +108,6 @@ def profile(
 
 
 @app.command()
-def network(
-    every: Annotated[bool, typer.Option("--every", help="All cells, not only the chosen.")] = False,
-    minutes: Annotated[float, typer.Option(help="Stop after this time; run again to go on.")] = 60,
-    json: Annotated[Path, typer.Option("--json", help="Read and extend these results.")] = Path(
-        "docs/benchmarks/network.json"
-    ),
-    page: Annotated[
-        Path | None, typer.Option(exists=True, help="Write table and plot for this page.")
-    ] = None,
-) -> None:
-    """Heartbeats and depth against packet loss and delay; needs root."""
-    from benchmarks import network
-
-    isolate()
-    results = network.NetworkResults(json)
-    cells = network.every() if every else network.chosen()
-    network.measure_network(results, cells, minutes, make_console().print)
-    if page:
-        network.write_network(results, page, json.parent)
-
-
-@app.command()
 def window(
     seconds: Annotated[float, typer.Option(min=0.1, help="Seconds between two events.")] = 2.0,
     plot: Annotated[Path, typer.Option(help="Where to draw it.")] = Path(
