@@ -23,8 +23,8 @@ from rosasync._cli.documents import (
     read_message,
 )
 from rosasync._cli.requests import template
+from rosasync._ros.fields import FieldType, field_types
 from rosasync._ros.interfaces import installed_types, parts
-from rosasync._ros.messages import FieldType, field_types
 
 PACKAGES = {
     "diagnostic_msgs",

@@ -33,6 +33,8 @@ WARM_UP = 200
 AT_ONCE = 10
 Call = Callable[[], Awaitable[object]]
 OWN = rosasync.__path__[0]
+CHECKS = "<rosasync check of "
+"""How the names of the functions that check messages begin, which are compiled at first use."""
 TESTING = f"{OWN}/testing/"
 
 
@@ -72,8 +74,8 @@ class Cost:
 FAKE = Cost(functions=17, c_functions=15, peak=2000, left=100, cycles=0)
 """On the fake graph, which keeps a list of everything sent."""
 BOUNDS = {
-    "direct": Cost(functions=20, c_functions=19, peak=1700, left=50, cycles=0),
-    "executor": Cost(functions=19, c_functions=17, peak=6300, left=50, cycles=0),
+    "direct": Cost(functions=21, c_functions=19, peak=1700, left=50, cycles=0),
+    "executor": Cost(functions=20, c_functions=17, peak=6300, left=50, cycles=0),
 }
 """The bytes include rclpy's own, the functions do not."""
 
@@ -95,7 +97,7 @@ async def _count_functions(call: Call, rounds: int) -> tuple[float, float]:
 
     def on_event(frame: FrameType, event: str, arg: Any) -> None:
         name = frame.f_code.co_filename
-        if name.startswith(OWN) and not name.startswith(TESTING):
+        if name.startswith((OWN, CHECKS)) and not name.startswith(TESTING):
             counts[event] += 1
 
     sys.setprofile(on_event)

@@ -173,11 +173,11 @@ async def test_types_and_requests_are_checked(world: World) -> None:
     service = world.node.describe(ECHO, "/port_echo", None)
     assert service.key == ("/port_echo", ECHO, None)
     srv_type = service.srv_type
-    request = world.node.make_request(srv_type, {"load_namespace": "x"})
+    request = world.node.make_message(srv_type.Request, {"load_namespace": "x"})
     assert isinstance(request, srv_type.Request)
-    assert world.node.make_request(srv_type, request) is request
+    assert world.node.make_message(srv_type.Request, request) is request
     with pytest.raises(TypeError):
-        world.node.make_request(srv_type, srv_type.Response())
+        world.node.make_message(srv_type.Request, srv_type.Response())
     with pytest.raises(ValueError, match="no_such_package"):
         world.node.describe("no_such_package/srv/Nothing", "/port_echo", None)
 

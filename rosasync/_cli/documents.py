@@ -16,7 +16,9 @@ from typing import Any
 
 import yaml
 
-from rosasync._ros.messages import FieldType, field_types, to_dict, to_message, type_name
+from rosasync._ros.fields import FieldType, field_types
+from rosasync._ros.messages import to_dict, to_message
+from rosasync._ros.types import type_name
 
 __all__ = ["DocumentError", "documents", "dump_json", "dump_yaml", "plain", "read_message"]
 

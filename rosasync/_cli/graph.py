@@ -8,7 +8,7 @@ from typing import Any
 
 import rosasync
 from rosasync._cli.errors import CliError, Code
-from rosasync._ros.messages import service_type
+from rosasync._ros.types import service_type
 
 __all__ = [
     "POLL",

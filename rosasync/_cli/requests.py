@@ -13,7 +13,7 @@ from typing import Any
 from rosasync._cli.documents import DocumentError, documents, dump_yaml, plain, read_message
 from rosasync._cli.errors import CliError, join
 from rosasync._ros.interfaces import Field, fields
-from rosasync._ros.messages import type_name
+from rosasync._ros.types import type_name
 
 __all__ = ["message_from", "requests_from", "split_type", "template"]
 

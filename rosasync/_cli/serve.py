@@ -23,7 +23,7 @@ from rosasync._cli.options import AsJson, Name, Type
 from rosasync._cli.output import note, print_value
 from rosasync._cli.requests import message_from
 from rosasync._cli.run import open_session, run
-from rosasync._ros.messages import field_types
+from rosasync._ros.fields import field_types
 
 __all__ = ["serve"]
 

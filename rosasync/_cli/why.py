@@ -11,8 +11,8 @@ from rosasync._cli.errors import Code
 from rosasync._cli.graph import explain_type, is_hidden, resolve, settle
 from rosasync._cli.options import AsJson, Name, OptionalType, Wait
 from rosasync._cli.run import open_session, run
-from rosasync._ros.messages import service_type
 from rosasync._ros.profile import SWITCH, switched_off
+from rosasync._ros.types import service_type
 
 __all__ = ["environment", "why"]
 

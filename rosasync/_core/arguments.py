@@ -55,8 +55,8 @@ class ArgumentChecker:
         Raises:
             TypeError, ValueError: an argument does not fit.
         """
-        if not isinstance(request, service.srv_type.Request):
-            request = self._node.make_request(service.srv_type, request)
+        if not service.fits(request):
+            request = self._node.make_message(service.srv_type.Request, request)
         if timeout is not ...:
             default = check_timeout(timeout, None)
         if retry is not None:

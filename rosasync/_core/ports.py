@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from rosasync.statistics import ServiceKey
@@ -60,12 +60,14 @@ class Service:
         srv_name: the name as given. rclpy resolves it again, and must not remap it twice.
         qos: the ``QoSProfile``, or None for the default.
         key: the key of the service in the pool.
+        fits: whether a value is a request that can be sent as it is.
     """
 
     srv_type: Any
     srv_name: str
     qos: Any
     key: ServiceKey
+    fits: Callable[[Any], bool] = field(compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,6 +165,8 @@ class ServicePort(Protocol):
             Undeliverable: the client cannot get the response.
             Unmatched: the client cannot get it yet.
             PortDestroyed: the service was destroyed.
+            TypeError, ValueError: a field has a value that cannot be sent; the message names its
+                path.
         """
 
     def has_clients(self) -> bool:
@@ -280,13 +284,6 @@ class NodePort(Protocol):
             ContextShutdown: the node is down.
         """
 
-    def make_request(self, srv_type: Any, request: Any) -> Any:
-        """Return a message of the request type, from a message, a mapping or None. Any thread.
-
-        Raises:
-            TypeError, ValueError: it does not fit.
-        """
-
     def open_client(self, service: Service, deliver: Deliver) -> ClientPort:
         """Create a client that passes its responses to ``deliver``.
 
@@ -309,10 +306,12 @@ class NodePort(Protocol):
         """
 
     def make_message(self, message_type: Any, value: Any) -> Any:
-        """Return a message of a type, from a message, a mapping or None. Any thread.
+        """Return a message to send, from a message, a mapping or None. From any thread.
+
+        A message is copied if one of its values has to be converted.
 
         Raises:
-            TypeError, ValueError: it does not fit.
+            TypeError, ValueError: it does not fit; the message names the path of the field.
         """
 
     def deserialize(self, message_type: Any, data: bytes) -> Any:

@@ -1,4 +1,4 @@
-"""Action types by their names, and the messages of actions. Needs no rclpy."""
+"""Action types by their names. Needs no rclpy."""
 
 from __future__ import annotations
 
@@ -6,12 +6,11 @@ import difflib
 import functools
 import importlib
 import re
-from collections.abc import Mapping
 from typing import Any
 
-from rosasync._ros.messages import to_message, type_name
+from rosasync._ros.types import type_name
 
-__all__ = ["action_type", "make_message"]
+__all__ = ["action_type"]
 
 _ACTION_NAME = re.compile(r"([a-z]\w*)/action/([a-z]\w*)", re.ASCII | re.IGNORECASE)
 
@@ -40,28 +39,6 @@ def action_type(wanted: type[Any] | str) -> type[Any]:
             f"{type_name(wanted)} is not an action: it has no Goal, Result and Feedback"
         )
     return wanted
-
-
-def make_message(message_type: type[Any], value: object) -> Any:
-    """Return a message of a type.
-
-    Args:
-        message_type: the class.
-        value: a message, returned as it is; a mapping of its fields, as in `to_message`; or None
-            for an empty one.
-
-    Raises:
-        TypeError: the value is anything else, or that of a field is of the wrong kind.
-        ValueError: no such field, or a value out of its range.
-    """
-    if isinstance(value, message_type):
-        return value
-    if value is None:
-        return message_type()
-    if isinstance(value, Mapping):
-        return to_message(message_type, value)
-    given = f"the class {type_name(value)}" if isinstance(value, type) else type_name(type(value))
-    raise TypeError(f"expected {type_name(message_type)}, got {given}")
 
 
 def _is_action(candidate: object) -> bool:

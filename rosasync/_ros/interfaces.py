@@ -10,8 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rosasync._ros.messages import FieldType, field_types, type_name
+from rosasync._ros.fields import FieldType, field_types
 from rosasync._ros.middleware import prefixes
+from rosasync._ros.types import type_name
 
 __all__ = ["Field", "Part", "constants", "fields", "installed_types", "parts"]
 

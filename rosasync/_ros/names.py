@@ -12,8 +12,9 @@ from rclpy.validate_full_topic_name import validate_full_topic_name
 
 from rosasync._core.ports import Action, Service
 from rosasync._ros.action_types import action_type
+from rosasync._ros.checks import checker
 from rosasync._ros.failures import uses_node
-from rosasync._ros.messages import service_type, type_name
+from rosasync._ros.types import service_type, type_name
 from rosasync.errors import InvalidServiceName
 from rosasync.statistics import ServiceKey
 
@@ -41,7 +42,7 @@ def describe(node: Node, srv_type: Any, srv_name: str, qos: Any) -> Service:
     srv_class = service_type(srv_type)
     qos_key = None if qos is None else str(qos)
     key = ServiceKey(resolve_name(node, srv_name), type_name(srv_class), qos_key)
-    return Service(srv_class, srv_name, qos, key)
+    return Service(srv_class, srv_name, qos, key, checker(srv_class.Request))
 
 
 def describe_action(node: Node, wanted: Any, action_name: str) -> Action:

@@ -31,15 +31,16 @@ from rosasync._core.ports import (
     SubscriptionPort,
     TopicQos,
 )
-from rosasync._ros import action_types, discovery, names, profile, rcl
+from rosasync._ros import discovery, names, profile, rcl
 from rosasync._ros.direct_bridge import DirectBridge
 from rosasync._ros.executor_bridge import ExecutorBridge
 from rosasync._ros.executor_thread import ExecutorThread, ThreadUser, executor_thread_of
 from rosasync._ros.failures import RclpyError, check_up, is_up, refusal, topic_refusal
 from rosasync._ros.graph import GraphQueries, GraphWaitable
-from rosasync._ros.messages import request_message, type_name
+from rosasync._ros.messages import make_message
 from rosasync._ros.shared_memory import check_ports
 from rosasync._ros.topics import Publisher, qos_profile
+from rosasync._ros.types import type_name
 from rosasync.errors import RosasyncError, UsageError
 from rosasync.options import SessionOptions
 
@@ -146,10 +147,6 @@ class RosNode:
         """Check and resolve a service."""
         return names.describe(self._node, srv_type, srv_name, qos)
 
-    def make_request(self, srv_type: Any, request: Any) -> Any:
-        """Return a message of the request type."""
-        return request_message(srv_type, request)
-
     def open_client(self, service: Service, deliver: Deliver) -> ClientPort:
         """Create a client that passes its responses to ``deliver``."""
         try:
@@ -176,8 +173,8 @@ class RosNode:
         return names.describe_action(self._node, action_type, action_name)
 
     def make_message(self, message_type: Any, value: Any) -> Any:
-        """Return a message of a type, from a message, a mapping or None."""
-        return action_types.make_message(message_type, value)
+        """Return a message to send, from a message, a mapping or None."""
+        return make_message(message_type, value)
 
     def deserialize(self, message_type: Any, data: bytes) -> Any:
         """Return the message in the bytes that a raw subscription delivers."""

@@ -15,6 +15,7 @@ from rclpy.qos import QoSProfile
 from rclpy.service import Service
 
 from rosasync._core.ports import RequestHeader, Undeliverable, Unmatched
+from rosasync._ros.checks import checker
 from rosasync._ros.endpoints import (
     GUID_PREFIX,
     gid_of,
@@ -25,6 +26,7 @@ from rosasync._ros.endpoints import (
 )
 from rosasync._ros.failures import RclpyError, explain, is_destroyed, uses_node
 from rosasync._ros.fastdds import acknowledged
+from rosasync._ros.messages import make_message
 
 __all__ = ["Responder", "client_of"]
 
@@ -118,6 +120,8 @@ class Responder:
         self._node = node
         self._handle = service.handle
         self._send = service.handle.service_send_response
+        self._response_type = service.srv_type.Response
+        self._fits = checker(self._response_type)
         self._srv_name = str(service.service_name)
         self._qos = qos
         self._graph = ClientGraph(node, self._srv_name)
@@ -134,7 +138,10 @@ class Responder:
             Unmatched: the client cannot get it yet.
             PortDestroyed: the service was destroyed.
             ContextShutdown: the node is down.
+            TypeError, ValueError: a field has a value that cannot be sent.
         """
+        if not self._fits(response):
+            response = make_message(self._response_type, response)
         unreached = self._check(header) if self._watching else None
         failure = None
         with _sends:

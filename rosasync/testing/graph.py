@@ -34,8 +34,10 @@ from rosasync._core.ports import (
     TopicQos,
     Undeliverable,
 )
-from rosasync._ros.action_types import action_type, make_message
-from rosasync._ros.messages import request_message, service_type, type_name
+from rosasync._ros.action_types import action_type
+from rosasync._ros.checks import checker
+from rosasync._ros.messages import make_message
+from rosasync._ros.types import service_type, type_name
 from rosasync.errors import InvalidServiceName
 from rosasync.session import Session
 from rosasync.statistics import ServiceKey
@@ -142,6 +144,7 @@ class FakeService(FakeServer):
     ) -> None:
         super().__init__(graph, srv_type, srv_name, lambda request: None, depth=1000)
         self.sent: list[Any] = []
+        self._response_type = srv_type.Response
         self._deliver = deliver
         self._stopped = False
         self._loop = asyncio.get_running_loop()
@@ -151,7 +154,9 @@ class FakeService(FakeServer):
 
         Raises:
             Undeliverable: its client is closed.
+            TypeError, ValueError: a field has a value that cannot be sent.
         """
+        response = make_message(self._response_type, response)
         if header.client.closed:
             raise Undeliverable("the client is gone")
         copy = deepcopy(response)
@@ -321,11 +326,7 @@ class FakeNode:
         """Check and resolve a service."""
         srv_class = service_type(srv_type)
         key = ServiceKey(self._resolve(srv_name), type_name(srv_class), qos)
-        return Service(srv_class, srv_name, qos, key)
-
-    def make_request(self, srv_type: Any, request: Any) -> Any:
-        """Return a message of the request type."""
-        return request_message(srv_type, request)
+        return Service(srv_class, srv_name, qos, key, checker(srv_class.Request))
 
     def describe_action(self, wanted: Any, action_name: str) -> Action:
         """Check and resolve an action."""

@@ -12,7 +12,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-from rosasync._ros.messages import service_type, to_dict, to_message, type_name
+from rosasync._ros.messages import to_dict, to_message
+from rosasync._ros.types import service_type, type_name
 from rosasync.testing.hooks import GraphSession, Hooks
 
 if TYPE_CHECKING:

@@ -9,7 +9,8 @@ from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self, TypeAlias
 
-from rosasync._ros.messages import service_type, to_dict, to_message
+from rosasync._ros.messages import to_dict, to_message
+from rosasync._ros.types import service_type
 from rosasync.testing.faults import Faults, FaultyService, StubCall, set_in_block
 from rosasync.testing.matching import check_fields, count, describe, difference, matches
 
