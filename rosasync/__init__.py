@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from rosasync._actions.server import ActionServer
+from rosasync._actions.server_goal import ServerGoal
 from rosasync._actions.status import GoalStatus
 from rosasync._client.pool import ClientPool, LeasedClient
 from rosasync._core.futures import wrap_future
@@ -31,6 +33,7 @@ from rosasync.errors import (
 from rosasync.options import Limits, Retry
 from rosasync.session import ServiceClient, Session
 from rosasync.statistics import (
+    ActionServerStatistics,
     KeyStatistics,
     LatencyStatistics,
     PoolStatistics,
@@ -42,6 +45,8 @@ from rosasync.tracing import CallEnd, CallPhase, Trace, TracedCall
 from rosasync.typing import ActionType, ServiceType
 
 __all__ = [
+    "ActionServer",
+    "ActionServerStatistics",
     "ActionType",
     "AsyncServiceProxy",
     "CallEnd",
@@ -70,6 +75,7 @@ __all__ = [
     "ResponseTimeout",
     "Retry",
     "RosasyncError",
+    "ServerGoal",
     "ServerGone",
     "ServerStatistics",
     "ServiceCall",

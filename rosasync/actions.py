@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from rosasync._actions.server import ActionServer
+from rosasync._actions.server_goal import ServerGoal
 from rosasync._actions.status import GoalStatus
 from rosasync.errors import (
     CancelRejected,
@@ -11,9 +13,12 @@ from rosasync.errors import (
     GoalRejected,
     GoalTimeout,
 )
+from rosasync.statistics import ActionServerStatistics
 from rosasync.typing import ActionType
 
 __all__ = [
+    "ActionServer",
+    "ActionServerStatistics",
     "ActionType",
     "CancelRejected",
     "GoalAborted",
@@ -22,4 +27,5 @@ __all__ = [
     "GoalRejected",
     "GoalStatus",
     "GoalTimeout",
+    "ServerGoal",
 ]

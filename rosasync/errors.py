@@ -55,6 +55,10 @@ NO_GOAL = UUID(int=0)
 """The UUID of an error that a handler raises: rosasync knows the goal by then."""
 
 
+NO_GOAL = UUID(int=0)
+"""The goal of an error that a handler raises: the client's error has its own."""
+
+
 class RosasyncError(Exception):
     """The base of all errors that rosasync defines."""
 

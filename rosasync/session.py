@@ -14,7 +14,16 @@ from rosasync._ros.middleware import check_middleware
 from rosasync.errors import UsageError
 from rosasync.options import Limits, Retry, SessionOptions, check_timeout
 from rosasync.statistics import SessionStatistics
-from rosasync.typing import RequestT, ResponseT, ServiceType, Timeout
+from rosasync.typing import (
+    ActionType,
+    FeedbackT,
+    GoalT,
+    RequestT,
+    ResponseT,
+    ResultT,
+    ServiceType,
+    Timeout,
+)
 
 if TYPE_CHECKING:
     from rclpy.context import Context
@@ -22,6 +31,9 @@ if TYPE_CHECKING:
     from rclpy.node import Node
     from rclpy.qos import QoSProfile
 
+    from rosasync._actions.goal_runner import GoalErrorHook, GoalHandler, OnBusy
+    from rosasync._actions.intake import CancelHook, GoalHook
+    from rosasync._actions.server import ActionServer
     from rosasync._client.pool import ClientPool
     from rosasync._client.service_pool import ServicePool
     from rosasync._core.gateway import LoopGateway
@@ -206,6 +218,7 @@ class Session:
             bridge=core.node.bridge,
             pool=core.pool.statistics(),
             servers=tuple(server.statistics() for server in core.servers),
+            action_servers=tuple(server.statistics() for server in core.action_servers),
         )
 
     @overload
@@ -507,6 +520,111 @@ class Session:
             qos=qos,
             on_error=on_error,
             on_overload=on_overload,
+        )
+
+    @overload
+    def serve_action(
+        self,
+        action_type: ActionType[GoalT, ResultT, FeedbackT],
+        action_name: str,
+        handler: GoalHandler[GoalT, FeedbackT, ResultT],
+        *,
+        on_goal: GoalHook[GoalT] | None = None,
+        on_cancel: CancelHook[GoalT, FeedbackT] | None = None,
+        on_busy: OnBusy = "queue",
+        concurrency: int = 1,
+        backlog: int = 10,
+        result_timeout: float | None = 900.0,
+        on_error: GoalErrorHook[GoalT, FeedbackT, ResultT] | None = None,
+    ) -> ActionServer[GoalT, ResultT, FeedbackT]: ...
+
+    @overload
+    def serve_action(
+        self,
+        action_type: str,
+        action_name: str,
+        handler: GoalHandler[Any, Any, Any],
+        *,
+        on_goal: GoalHook[Any] | None = None,
+        on_cancel: CancelHook[Any, Any] | None = None,
+        on_busy: OnBusy = "queue",
+        concurrency: int = 1,
+        backlog: int = 10,
+        result_timeout: float | None = 900.0,
+        on_error: GoalErrorHook[Any, Any, Any] | None = None,
+    ) -> ActionServer[Any, Any, Any]: ...
+
+    def serve_action(
+        self,
+        action_type: Any,
+        action_name: str,
+        handler: GoalHandler[Any, Any, Any],
+        *,
+        on_goal: GoalHook[Any] | None = None,
+        on_cancel: CancelHook[Any, Any] | None = None,
+        on_busy: OnBusy = "queue",
+        concurrency: int = 1,
+        backlog: int = 10,
+        result_timeout: float | None = 900.0,
+        on_error: GoalErrorHook[Any, Any, Any] | None = None,
+    ) -> ActionServer[Any, Any, Any]:
+        """Serve an action from now until the server or the session is closed.
+
+        ::
+
+            async def drive(goal):
+                for distance in range(10):
+                    await base.step()
+                    goal.feedback({"distance": distance})
+                return {"total": 10}
+
+            async with session.serve_action(Drive, "/drive", drive):
+                ...
+
+        Args:
+            action_type: an action class or its name, ``"test_msgs/action/Fibonacci"``.
+            action_name: the action's name.
+            handler: ``handler(goal)`` with a `ServerGoal`, async. It returns the result, a message
+                or a mapping of its fields, and the goal has SUCCEEDED. If it raises an exception,
+                the goal is ABORTED, with the result of a `GoalAborted` if it is one. A cancellation
+                arrives as ``CancelledError``: if it passes, or if the handler then returns a
+                result, the goal is CANCELED.
+            on_goal: ``on_goal(request)`` with the goal's message, plain or async, which returns
+                whether to accept the goal. None to accept each.
+            on_cancel: ``on_cancel(goal)``, plain or async, which returns whether to cancel a goal
+                that a client wants to cancel. None to cancel it.
+            on_busy: what happens to a goal that comes while ``concurrency`` goals run. ``"queue"``:
+                it is accepted, and waits for its turn, unless ``backlog`` goals wait already.
+                ``"reject"``: it is rejected. ``"replace"``: it is accepted, the oldest goal is
+                cancelled, and it starts when that has ended.
+            concurrency: the maximum number of handlers that run at a time.
+            backlog: the maximum number of goals that wait, with ``"queue"``.
+            result_timeout: seconds for which the result of a goal is kept after its end, for
+                clients that ask for it then; None to keep it until the server ends.
+            on_error: ``on_error(goal, error)``, plain or async, called when the handler has raised
+                an exception, or returned something other than a result. It may return the result of
+                the goal, which is ABORTED.
+
+        Raises:
+            TypeError: the handler is not an async function of one argument, a hook is not
+                callable, or the type does not fit.
+            ValueError: a limit is out of range; the action type does not exist.
+            InvalidServiceName: ROS does not allow the name.
+            UsageError: this process serves or calls another type under this name.
+            SessionClosed, ContextShutdown: the session has ended, or has begun to.
+        """
+        return self._use().serve_action(
+            self.serve,
+            action_type,
+            action_name,
+            handler,
+            on_goal=on_goal,
+            on_cancel=on_cancel,
+            on_busy=on_busy,
+            concurrency=concurrency,
+            backlog=backlog,
+            result_timeout=result_timeout,
+            on_error=on_error,
         )
 
     async def aclose(self) -> None:

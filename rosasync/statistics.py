@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 __all__ = [
+    "ActionServerStatistics",
     "KeyStatistics",
     "LatencyStatistics",
     "PoolStatistics",
@@ -142,15 +143,53 @@ class ServerStatistics:
 
 
 @dataclass(frozen=True, slots=True)
+class ActionServerStatistics:
+    """A snapshot of an action server's statistics.
+
+    ``running``, ``waiting``, ``results`` and ``asking`` are current. The counts after them are
+    totals.
+
+    Attributes:
+        action_name: the resolved name.
+        running: goals whose handlers run now.
+        waiting: accepted goals that wait for their turn.
+        results: results that are kept, until ``result_timeout`` after the end of their goals.
+        asking: requests for results that wait for the end of their goals.
+        accepted: goals accepted.
+        rejected: goals rejected: by ``on_goal``, because the server was busy, or because their id
+            was in use.
+        succeeded: goals whose handlers have returned their results.
+        canceled: goals that have ended because they were cancelled, or replaced.
+        aborted: goals whose handlers have failed, or were running when the server ended.
+        feedback: feedback messages published.
+    """
+
+    action_name: str
+    running: int = 0
+    waiting: int = 0
+    results: int = 0
+    asking: int = 0
+    accepted: int = 0
+    rejected: int = 0
+    succeeded: int = 0
+    canceled: int = 0
+    aborted: int = 0
+    feedback: int = 0
+
+
+@dataclass(frozen=True, slots=True)
 class SessionStatistics:
     """A snapshot of a session's statistics.
 
     Attributes:
         bridge: ``"direct"`` or ``"executor"``.
         pool: the statistics of the client pool.
-        servers: the statistics of each server that is not closed.
+        servers: the statistics of each server that is not closed. The three services of an action
+            are servers, too.
+        action_servers: the statistics of each action server that is not closed.
     """
 
     bridge: str
     pool: PoolStatistics
     servers: tuple[ServerStatistics, ...] = ()
+    action_servers: tuple[ActionServerStatistics, ...] = ()

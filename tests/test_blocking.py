@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from rosasync._server.handlers import BLOCKING
+from rosasync._server.blocking import BLOCKING
 from tests.support.echo import ECHO
 from tests.support.serving import AnyCall, ask, discard, echo_of
 from tests.support.times import until
@@ -34,7 +34,8 @@ class Clock:
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     """Replace the clock of the handlers, so that a busy machine is not mistaken for blocking."""
     clock = Clock()
-    monkeypatch.setattr("rosasync._server.handlers.monotonic", clock)
+    for module in ("handlers", "blocking"):
+        monkeypatch.setattr(f"rosasync._server.{module}.monotonic", clock)
     return clock
 
 

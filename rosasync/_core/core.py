@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import anyio
 
+from rosasync._actions.server import ActionServer
 from rosasync._client.pool import ClientPool
 from rosasync._core.aio import until_done
 from rosasync._core.arguments import ArgumentChecker
@@ -24,6 +25,7 @@ from rosasync.errors import ContextShutdown, SessionClosed, UsageError
 from rosasync.tracing import Tracing
 
 if TYPE_CHECKING:
+    from rosasync._actions.server import ServeService
     from rosasync._core.ports import NodePort
     from rosasync.options import SessionOptions
 
@@ -63,6 +65,8 @@ class Core:
         self.portal = Portal(self.node, self.gateway, self.arguments, self.pool, options.timeout)
         # A server removes itself when it ends, by its `on_end`.
         self.servers: dict[ServiceServer[Any, Any], None] = {}
+        # The same. Their services are among the servers.
+        self.action_servers: dict[ActionServer[Any, Any, Any], None] = {}
         self.closed = False
         self._session = weakref.ref(session)
         self._end_task: asyncio.Task[None] | None = None
@@ -105,10 +109,30 @@ class Core:
         self.servers[server] = None
         return server
 
+    def serve_action(
+        self, serve: ServeService, action_type: Any, action_name: str, handler: Any, **options: Any
+    ) -> ActionServer[Any, Any, Any]:
+        """Create an action server that ends with the session; ``serve`` serves its services."""
+        if self.closed:
+            raise session_closed()
+        self.pool.check_open()
+        server = ActionServer[Any, Any, Any](
+            self.node,
+            serve,
+            self.node.describe_action(action_type, action_name),
+            handler,
+            on_end=self.action_servers.pop,
+            **options,
+        )
+        self.action_servers[server] = None
+        return server
+
     async def aclose(self) -> None:
         """End everything; idempotent. All callers wait for the same task."""
         self.closed = True
         # Before the task is created, because an eager one closes the servers at once.
+        for action_server in self.action_servers:
+            action_server.exclude_caller()
         for server in self.servers:
             server.exclude_caller()
         if self._end_task is None:
@@ -162,6 +186,8 @@ class Core:
     async def _end(self) -> None:
         # Each step also if the end of the loop cancels this task, as `asyncio.run` does.
         try:
+            # First, while their services can still send the results.
+            await asyncio.gather(*(server.aclose() for server in self.action_servers))
             await asyncio.gather(*(server.aclose() for server in self.servers))
         finally:
             self.pool.end(session_closed)
@@ -193,12 +219,16 @@ class Core:
         self.pool.graph_changed()
         for server in tuple(self.servers):
             server.check_port()
+        for action_server in tuple(self.action_servers):
+            action_server.check_ports()
 
     def _context_shut_down(self) -> None:
         self.pool.end(ContextShutdown)
         self._end_servers(ContextShutdown)
 
     def _end_servers(self, ending: Callable[[], Exception]) -> None:
+        for action_server in tuple(self.action_servers):
+            action_server.end(ending)
         for server in tuple(self.servers):
             server.end(ending)
 

@@ -217,7 +217,9 @@ class PublisherPort(Protocol):
     """One rcl publisher. Call its methods on the loop's thread; every one returns at once."""
 
     def publish(self, message: Any) -> None:
-        """Publish a message. It is converted at once, so it may be changed afterwards.
+        """Publish a message, or the bytes of a serialized one.
+
+        It is converted at once, so it may be changed afterwards.
 
         Raises:
             PortDestroyed: the publisher was destroyed.
@@ -274,6 +276,13 @@ class NodePort(Protocol):
 
     def ok(self) -> bool:
         """Return whether the node and its context are up."""
+
+    def now(self) -> int:
+        """Return the time of the node's clock, in ns.
+
+        Raises:
+            ContextShutdown: the node is down.
+        """
 
     def describe(self, srv_type: Any, srv_name: str, qos: Any) -> Service:
         """Check and resolve a service. From any thread.

@@ -35,7 +35,14 @@ from rosasync._ros import discovery, names, profile, rcl
 from rosasync._ros.direct_bridge import DirectBridge
 from rosasync._ros.executor_bridge import ExecutorBridge
 from rosasync._ros.executor_thread import ExecutorThread, ThreadUser, executor_thread_of
-from rosasync._ros.failures import RclpyError, check_up, is_up, refusal, topic_refusal
+from rosasync._ros.failures import (
+    RclpyError,
+    check_up,
+    is_up,
+    refusal,
+    topic_refusal,
+    uses_node,
+)
 from rosasync._ros.graph import GraphQueries, GraphWaitable
 from rosasync._ros.messages import make_message
 from rosasync._ros.shared_memory import check_ports
@@ -142,6 +149,11 @@ class RosNode:
     def ok(self) -> bool:
         """Return whether the node and its context are up."""
         return is_up(self._node)
+
+    def now(self) -> int:
+        """Return the time of the node's clock, in ns."""
+        with uses_node(self._node):
+            return int(self._node.get_clock().now().nanoseconds)
 
     def describe(self, srv_type: Any, srv_name: str, qos: Any) -> Service:
         """Check and resolve a service."""

@@ -6,13 +6,13 @@ import asyncio
 import functools
 import inspect
 import logging
-from collections.abc import Awaitable, Callable, Coroutine, Generator
+from collections.abc import Awaitable, Callable, Coroutine
 from contextvars import Context, ContextVar
 from dataclasses import dataclass
 from time import monotonic
-from types import CoroutineType
 from typing import Any, Generic, TypeAlias, TypeVar
 
+from rosasync._server.blocking import BLOCKING, BlockingReport
 from rosasync._server.service_call import CallCounts, ResponseSender, ServiceCall
 from rosasync.errors import ContextShutdown, SessionClosed
 from rosasync.typing import RequestT, ResponseT
@@ -50,9 +50,6 @@ OverloadHook: TypeAlias = Callable[
 """``on_overload(call)``, plain or async."""
 
 logger = logging.getLogger("rosasync")
-
-BLOCKING = 0.1
-"""Seconds for which a handler may block the loop unreported. asyncio's debug mode has the same."""
 
 _handler_task: ContextVar[asyncio.Task[Any] | None] = ContextVar("handler_task", default=None)
 """The task of the handler, or hook, in whose context the code runs. Tasks that a handler starts
@@ -184,8 +181,7 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
         self._counts = counts
         self._tasks = tasks
         self._on_finished = on_finished
-        # Whether a handler has blocked the loop: it is reported once.
-        self._blocked = False
+        self._blocking = BlockingReport(sender.name, "" if kind is None else kind.name)
 
     def start(self, call: ServiceCall[RequestT, ResponseT]) -> None:
         """Run the handler: a plain one to its end, an async one in a task."""
@@ -202,7 +198,7 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
                 self._finish(call, result)
             else:
                 in_task = True
-                self._tasks.spawn(self._await_handler(call, self._timed(result)), context)
+                self._tasks.spawn(self._await_handler(call, self._blocking.timed(result)), context)
         except BaseException as error:
             self._contain(call, error, self._fail)
         finally:
@@ -245,13 +241,7 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
             return invoke(call) if context is None else context.run(invoke, call)
         finally:
             if monotonic() - began > BLOCKING:
-                self._report_blocking(monotonic() - began)
-
-    def _timed(self, pending: Awaitable[Any]) -> Awaitable[Any]:
-        """Return what awaits a handler, and reports it if one of its steps blocks the loop."""
-        if type(pending) is CoroutineType and not self._blocked:
-            return _TimedSteps(pending, self._report_blocking)
-        return pending
+                self._blocking.report(monotonic() - began)
 
     def _cancelled(self, call: ServiceCall[RequestT, ResponseT]) -> None:
         """Give up a call whose handler, or hook, was cancelled."""
@@ -343,18 +333,6 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
     def _give_up(self, call: ServiceCall[RequestT, ResponseT]) -> None:
         call.give_up("given up: its handler failed", failed=True)
 
-    def _report_blocking(self, seconds: float) -> None:
-        if self._blocked or self._kind is None:
-            return
-        self._blocked = True
-        logger.warning(
-            "%s: the handler %s has blocked the event loop for %.0f ms, in which nothing else ran: "
-            "do slow work in `await asyncio.to_thread(…)`. This is reported once for each server",
-            self._sender.name,
-            self._kind.name,
-            seconds * 1000,
-        )
-
     def _fail_hook(self, call: ServiceCall[RequestT, ResponseT], error: Exception) -> None:
         logger.error(
             "%s: on_error or on_overload raised an exception for %r",
@@ -362,45 +340,6 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
             call,
             exc_info=error,
         )
-
-
-class _TimedSteps:
-    """Awaits a coroutine, and reports each of its steps that blocks the loop for too long.
-
-    A step is what runs from one suspension to the next, so the time that an ``await`` takes does
-    not count.
-    """
-
-    __slots__ = ("_coroutine", "_report")
-
-    def __init__(
-        self, coroutine: Coroutine[Any, Any, Any], report: Callable[[float], None]
-    ) -> None:
-        self._coroutine = coroutine
-        self._report = report
-
-    def __await__(self) -> Generator[Any, Any, Any]:
-        coroutine = self._coroutine
-        step: Callable[[Any], Any] = coroutine.send
-        value: Any = None
-        while True:
-            began = monotonic()
-            try:
-                awaited = step(value)
-            except StopIteration as end:
-                return end.value
-            finally:
-                value = None  # An exception would refer to this frame, and the frame to it.
-                if monotonic() - began > BLOCKING:
-                    self._report(monotonic() - began)
-            try:
-                value = yield awaited
-                step = coroutine.send
-            except GeneratorExit:
-                coroutine.close()
-                raise
-            except BaseException as error:
-                step, value = coroutine.throw, error
 
 
 def settle_kind(

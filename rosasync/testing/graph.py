@@ -24,6 +24,7 @@ from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import Any
 
+from rosasync._actions.status_list import decode_statuses
 from rosasync._core.gateway import LoopGateway
 from rosasync._core.ports import (
     Action,
@@ -302,6 +303,8 @@ class FakeNode:
     ) -> None:
         self.graph = graph
         self.node = self
+        self._loop = asyncio.get_running_loop()
+        self._epoch = time.time_ns() - int(self._loop.time() * 1e9)
         self.up = True
         self.clients: list[FakeClient] = []
         self.on_graph = on_graph
@@ -321,6 +324,10 @@ class FakeNode:
     def ok(self) -> bool:
         """Return whether the context is up."""
         return self.up
+
+    def now(self) -> int:
+        """Return the time in ns, which a virtual clock moves forward."""
+        return self._epoch + int(self._loop.time() * 1e9)
 
     def describe(self, srv_type: Any, srv_name: str, qos: Any) -> Service:
         """Check and resolve a service."""
@@ -524,6 +531,9 @@ class FakePublisher:
 
     def publish(self, message: Any) -> None:
         """Send a copy of a message to every subscription of the topic."""
+        if isinstance(message, bytes):
+            # The only serialized message that rosasync publishes.
+            message = make_message(self.msg_type, decode_statuses(message))
         copy = deepcopy(message)
         self.published.append(copy)
         self._kept.append(copy)

@@ -1,0 +1,174 @@
+"""ServerGoals: what an action server tells its clients of its goals: status and results."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from rosasync._actions.goal_table import CancelSelection, GoalEvent, GoalRecord, GoalTable
+from rosasync._actions.status import GoalStatus
+from rosasync._actions.status_list import StatusList
+from rosasync.errors import ContextShutdown, SessionClosed
+
+if TYPE_CHECKING:
+    from rosasync._server.service_call import ServiceCall
+
+__all__ = ["ServerGoals"]
+
+logger = logging.getLogger("rosasync")
+
+
+class ServerGoals:
+    """The goals of a server, their status on the topic, and their results for those who ask.
+
+    Confined to the loop's thread.
+
+    Args:
+        name: the action's name, for the log.
+        table: the goals.
+        publish_status: publishes the serialized status message.
+        response_type: the class of the responses of ``get_result``.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        table: GoalTable,
+        publish_status: Callable[[bytes], None],
+        response_type: type[Any],
+    ) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._name = name
+        self._table = table
+        self._publish_status = publish_status
+        self._response_type = response_type
+        self._statuses = StatusList()
+        # Whether `_publish` is scheduled. One message for all changes of a turn: it lists every
+        # goal, and its subscribers keep the last one only.
+        self._publishing = False
+        # A goal is in `_askers` until it ends, and then in `_responses` until it expires.
+        self._askers: dict[bytes, list[ServiceCall[Any, Any]]] = {}
+        self._responses: dict[bytes, Any] = {}
+        # Runs when the first of the goals that have ended expires.
+        self._timer: asyncio.TimerHandle | None = None
+        self._closed = False
+
+    @property
+    def kept(self) -> int:
+        """The number of results that are kept."""
+        return len(self._responses)
+
+    @property
+    def asking(self) -> int:
+        """The number of requests for results that wait for the end of their goal."""
+        return sum(map(len, self._askers.values()))
+
+    @property
+    def closed(self) -> bool:
+        """Whether the server has ended."""
+        return self._closed
+
+    def knows(self, goal_id: bytes) -> bool:
+        """Return whether a goal was accepted and has not expired."""
+        return self._table.get(goal_id) is not None
+
+    def select(self, goal_id: bytes, stamp: int) -> CancelSelection:
+        """Return the goals that a cancel request asks for; see `GoalTable.select`."""
+        return self._table.select(goal_id, stamp)
+
+    def accept(self, goal_id: bytes, stamp: int) -> GoalRecord:
+        """Add a goal that was accepted at this time, in ns of the node's clock."""
+        record = self._table.accept(goal_id, stamp)
+        self._askers[goal_id] = []
+        self._show(record)
+        return record
+
+    def apply(self, record: GoalRecord, event: GoalEvent) -> bool:
+        """Change the status of a goal that has not ended; False if its status does not allow it."""
+        if not self._table.apply(record, event, self._loop.time()):
+            return False
+        self._show(record)
+        return True
+
+    def end(self, record: GoalRecord, event: GoalEvent, result: Any) -> bool:
+        """End a goal, and send its result to those who wait for it.
+
+        Args:
+            record: the goal.
+            event: how it ends.
+            result: its result, which must not be changed afterwards.
+
+        Returns:
+            False if it has ended already.
+        """
+        if not self.apply(record, event):
+            return False
+        response = self._response_type()
+        response.status = int(record.status)
+        response.result = result
+        self._responses[record.id] = response
+        for call in self._askers.pop(record.id):
+            self._respond(call, response)
+        self._arm()
+        return True
+
+    def on_get_result(self, call: ServiceCall[Any, Any]) -> None:
+        """Handle a request for a result: answer it when the goal has ended.
+
+        The handler of the service ``get_result``.
+        """
+        goal_id = call.request.goal_id.uuid.tobytes()
+        if goal_id in self._askers:
+            self._askers[goal_id].append(call)
+        elif goal_id in self._responses:
+            self._respond(call, self._responses[goal_id])
+        else:
+            logger.info(
+                "%s: the result of goal %s was asked for, which is unknown or has expired",
+                self._name,
+                goal_id.hex(),
+            )
+            # The result of a fresh response is an empty one.
+            call.response.status = int(GoalStatus.UNKNOWN)
+            self._respond(call, call.response)
+
+    def close(self) -> None:
+        """Stop publishing, and let nothing expire any more; idempotent."""
+        self._closed = True
+        if self._timer is not None:
+            self._timer.cancel()
+
+    def _show(self, record: GoalRecord) -> None:
+        self._statuses.set(record.id, record.stamp, record.status)
+        if not self._publishing:
+            self._publishing = True
+            self._loop.call_soon(self._publish)
+
+    def _publish(self) -> None:
+        self._publishing = False
+        if not self._closed:
+            self._publish_status(self._statuses.encode())
+
+    def _respond(self, call: ServiceCall[Any, Any], response: Any) -> None:
+        # One that cannot be answered must not keep the others from it.
+        try:
+            call.respond(response)
+        except (SessionClosed, ContextShutdown):
+            return
+        except Exception:
+            logger.exception("%s: a result cannot be sent", self._name)
+            call.give_up("given up: its result cannot be sent", failed=True)
+
+    def _arm(self) -> None:
+        if self._timer is None and not self._closed and (due := self._table.expiry()) is not None:
+            self._timer = self._loop.call_at(due, self._expire, due)
+
+    def _expire(self, due: float) -> None:
+        self._timer = None
+        # The loop runs timers up to one clock resolution early.
+        for record in self._table.expire(max(due, self._loop.time())):
+            del self._responses[record.id]
+            self._statuses.remove(record.id)
+        self._arm()

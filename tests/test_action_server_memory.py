@@ -1,0 +1,120 @@
+"""Action servers on a graph in memory: virtual time, and what many goals leave behind."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import tracemalloc
+import uuid
+from typing import Any
+
+import pytest
+from action_msgs.msg import GoalStatusArray
+from test_msgs.action import Fibonacci
+
+from rosasync import GoalStatus, Session
+from rosasync._core.ports import TopicQos
+from rosasync.testing import FakeGraph, VirtualClock
+from tests.support.times import until
+
+SEND, GET = Fibonacci.Impl.SendGoalService, Fibonacci.Impl.GetResultService
+
+
+async def at_once(goal: Any) -> Any:
+    return {"sequence": [goal.request.order]}
+
+
+def goal_of(order: int = 0) -> Any:
+    request = SEND.Request()
+    request.goal_id.uuid = list(uuid.uuid4().bytes)
+    request.goal.order = order
+    return request
+
+
+async def run(session: Session, request: Any) -> Any:
+    """Send a goal, and return the response with its result."""
+    assert (await session.call(SEND, "/fib/_action/send_goal", request)).accepted
+    return await get(session, request)
+
+
+async def get(session: Session, request: Any) -> Any:
+    return await session.call(
+        GET, "/fib/_action/get_result", {"goal_id": request.goal_id}, timeout=None
+    )
+
+
+async def test_a_goal(fake_graph: FakeGraph) -> None:
+    async with fake_graph.session() as session:
+        messages: list[GoalStatusArray] = []
+        session.core.node.open_subscription(
+            GoalStatusArray, "/fib/_action/status", TopicQos(), messages.append
+        )
+        async with session.serve_action(Fibonacci, "fib", at_once) as server:
+            assert server.action_name == "/fib"
+            response = await run(session, goal_of(3))
+            assert (response.status, list(response.result.sequence)) == (GoalStatus.SUCCEEDED, [3])
+            await until(lambda: messages)
+            assert messages[-1].status_list[0].status == GoalStatus.SUCCEEDED
+
+
+async def test_results_expire_after_their_time(
+    fake_graph: FakeGraph, virtual_clock: VirtualClock
+) -> None:
+    async with fake_graph.session() as session:
+        server = session.serve_action(Fibonacci, "/fib", at_once)
+        request = goal_of()
+        await run(session, request)
+        await virtual_clock.advance(890.0)
+        later = goal_of()
+        assert later != request
+        await run(session, later)
+        assert server.statistics().results == 2
+        assert (await get(session, request)).status == GoalStatus.SUCCEEDED
+        await virtual_clock.advance(11.0)
+        assert server.statistics().results == 1
+        assert (await get(session, request)).status == GoalStatus.UNKNOWN
+        await virtual_clock.advance(890.0)
+        assert server.statistics().results == 0
+
+
+@pytest.mark.parametrize("timeout", [None, float("inf")])
+async def test_results_without_an_expiry(
+    fake_graph: FakeGraph, virtual_clock: VirtualClock, timeout: float | None
+) -> None:
+    async with fake_graph.session() as session:
+        server = session.serve_action(Fibonacci, "/fib", at_once, result_timeout=timeout)
+        await run(session, goal_of())
+        await virtual_clock.advance(1e6)
+        assert server.statistics().results == 1
+
+
+async def test_many_goals_leave_nothing_behind(fake_graph: FakeGraph) -> None:
+    async with fake_graph.session() as session:
+        server = session.serve_action(
+            Fibonacci, "/fib", at_once, concurrency=10, result_timeout=0.01
+        )
+
+        async def goals(count: int) -> int:
+            for _ in range(count // 10):
+                await asyncio.gather(*(run(session, goal_of()) for _ in range(10)))
+                # The graph in memory keeps what was sent.
+                for port in (*fake_graph.servers, *fake_graph.publishers):
+                    vars(port).get("sent", []).clear()
+                    vars(port).get("received", []).clear()
+                    vars(port).get("published", []).clear()
+                for node in fake_graph.nodes:
+                    for client in node.clients:
+                        client.sent.clear()
+            await until(lambda: server.statistics().results == 0)
+            gc.collect()
+            return tracemalloc.get_traced_memory()[0]
+
+        tracemalloc.start()
+        try:
+            await goals(200)
+            before = await goals(200)
+            after = await goals(2000)
+        finally:
+            tracemalloc.stop()
+        assert server.statistics().succeeded == 2400
+        assert after - before < 50_000
