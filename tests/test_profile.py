@@ -16,7 +16,7 @@ import pytest
 
 from benchmarks.hosts import NoHosts
 from benchmarks.lossy import LossyHosts
-from rosasync._ros import profile
+from rosasync._ros import configuration, fastdds, profile
 from tests.support.process import first_line, own
 from tests.support.program import as_root, own_shared_memory
 from tests.support.times import LIMIT, TICK, until
@@ -89,6 +89,11 @@ async def run_client(
 class TestSession:
     async def test_a_session_uses_it(self, hosts: LossyHosts, tmp_path: Path) -> None:
         log = await run_client(hosts, "session", tmp_path, {}, often=True)
+        assert "profile" not in log
+
+    async def test_after_a_stock_node(self, hosts: LossyHosts, tmp_path: Path) -> None:
+        """Fast DDS reads profile files before the first participant of a process only."""
+        log = await run_client(hosts, "late session", tmp_path, {}, often=True)
         assert "profile" not in log
 
     async def test_switched_off(self, hosts: LossyHosts, tmp_path: Path) -> None:
@@ -164,60 +169,90 @@ def test_the_middleware_reports_errors_on_stderr() -> None:
     assert "RTPS_TRANSPORT_SHM" in done.stderr
 
 
+@pytest.fixture
+def fresh(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The state of a process that has configured nothing."""
+    monkeypatch.delenv(VARIABLE, raising=False)
+    monkeypatch.delenv(profile.SWITCH, raising=False)
+    for name, value in (("loaded", False), ("reported", False), ("offset", None)):
+        monkeypatch.setattr(configuration._State, name, value)
+    monkeypatch.setattr(configuration._State, "offsets", set())
+
+
+@pytest.mark.usefixtures("fresh")
 def test_an_unreadable_profile_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(profile._State, "applied", False)
     file = tmp_path / "mine.xml"
     file.write_text("<profiles>")
     monkeypatch.setenv(VARIABLE, str(file))
-    with caplog.at_level("INFO", "rosasync"), profile.applied(first=True):
-        assert os.environ[VARIABLE] == str(file)
+    with caplog.at_level("INFO", "rosasync"):
+        configuration.configure(0)
     assert f"{file} cannot be read" in caplog.text
+    assert not configuration.heartbeats()
 
 
-def test_nothing_stays(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(profile._State, "applied", False)
-    monkeypatch.delenv(VARIABLE, raising=False)
-    monkeypatch.delenv(profile.SWITCH, raising=False)
-    with profile.applied(first=True):
-        file = Path(os.environ[VARIABLE])
-        assert profile.missing_heartbeats(file.read_text()) == []
-    assert VARIABLE not in os.environ
-    assert not file.parent.exists()
+@pytest.mark.usefixtures("fresh")
+def test_a_middleware_that_loads_no_profile(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(fastdds, "LOAD_STRING", "no_such_function")
+    fastdds._load_profiles.cache_clear()
+    try:
+        with caplog.at_level("INFO", "rosasync"):
+            configuration.configure(0)
+            configuration.configure(0)
+    finally:
+        fastdds._load_profiles.cache_clear()
+    assert not configuration.heartbeats()
+    assert caplog.text.count("does not load rosasync's profile") == 1
+
+
+@pytest.mark.usefixtures("fresh")
+def test_a_users_profile_that_may_have_come_too_late(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "mine.xml"
+    file.write_text(ONLY_CLIENT)
+    monkeypatch.setenv(VARIABLE, str(file))
+    assert not configuration.heartbeats()
+    environ = tmp_path / "environ"
+    environ.write_text(f"A=1\0{VARIABLE}={file}\0B=2")
+    monkeypatch.setattr(configuration, "INITIAL_ENVIRONMENT", environ)
+    assert configuration.heartbeats()
 
 
 OPEN = """
-import asyncio, logging, sys
+import asyncio, logging, os, sys, tempfile
 import rclpy, rosasync
-from rosasync._ros import profile
+from rosasync._ros import configuration
 
 async def main():
     if "late" in sys.argv:
-        rclpy.init()
-        node = rclpy.create_node("before")
+        rclpy.init(domain_id=(int(os.environ["ROS_DOMAIN_ID"]) + 1) % 100)
+        rclpy.create_node("before").destroy_node()
+        rclpy.shutdown()
     for _ in range(2):
         async with rosasync.Session():
-            print(profile.heartbeats())
+            print(configuration.heartbeats())
 
+before = dict(os.environ)
+tempfile.tempdir = "/no/such/folder"
 logging.basicConfig(level=logging.INFO, format="%(message)s")
 asyncio.run(main())
+assert before == dict(os.environ)
 """
 
 
 @pytest.mark.parametrize(
-    ("arguments", "environment", "known", "logged"),
-    [
-        ([], {}, "True", 0),
-        ([], {profile.SWITCH: "off"}, "False", 0),
-        (["late"], {}, "False", 1),
-    ],
+    ("arguments", "environment", "known"),
+    [([], {}, "True"), ([], {profile.SWITCH: "off"}, "False"), (["late"], {}, "True")],
     ids=["first", "off", "late"],
 )
 def test_a_session_knows_whether_the_profile_was_read(
-    arguments: list[str], environment: dict[str, str], known: str, logged: int
+    arguments: list[str], environment: dict[str, str], known: str
 ) -> None:
-    """The default depth of clients depends on it."""
+    """The default depth of clients depends on it. No temporary folder is needed."""
     done = subprocess.run(
         [sys.executable, "-c", OPEN, *arguments],
         capture_output=True,
@@ -226,4 +261,4 @@ def test_a_session_knows_whether_the_profile_was_read(
         env={**os.environ, **environment},
     )
     assert own(done.stdout).split() == [known, known]
-    assert done.stderr.count("Fast DDS has read its profiles before") == logged
+    assert "profile" not in done.stderr

@@ -1,4 +1,4 @@
-"""Asks Fast DDS whether responses were acknowledged, which neither rcl nor rclpy can tell."""
+"""The functions of Fast DDS that neither rcl nor rclpy offers, through ctypes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 from rclpy.utilities import get_rmw_implementation_identifier
 
-__all__ = ["acknowledged"]
+__all__ = ["acknowledged", "load_profiles"]
 
 RMW = "rmw_fastrtps_cpp"
 RESPONSE_WRITER = "_ZN16rmw_fastrtps_cpp23get_response_datawriterEP13rmw_service_s"
@@ -20,6 +20,15 @@ WAITS = (
 )
 """``DataWriter::wait_for_acknowledgments(const Duration_t &)`` of Fast DDS 2.14 (Jazzy) and 3
 (Kilted). Both return a code of 32 bits in a register: an integer, or a trivial class around one."""
+
+FACTORY = "_ZN8eprosima7fastdds3dds24DomainParticipantFactory"
+GET_FACTORY = f"{FACTORY}12get_instanceEv"
+LOAD_DEFAULT = f"{FACTORY}13load_profilesEv"
+LOAD_STRING = f"{FACTORY}24load_XML_profiles_stringEPKcm"
+SET_DEFAULT = f"{FACTORY}27set_default_participant_qosERKNS1_20DomainParticipantQosE"
+QOS_DEFAULT = "_ZN8eprosima7fastdds3dds23PARTICIPANT_QOS_DEFAULTE"
+"""Public functions of ``DomainParticipantFactory``, and the QoS that stands for the default
+profile. They have these names in Fast DDS 2.14 and 3, and return codes as above."""
 
 
 class Duration(ctypes.Structure):
@@ -60,6 +69,62 @@ def acknowledged(service: Any) -> bool:
     """
     acknowledgements = _load()
     return acknowledgements is not None and acknowledgements.complete(service.pointer)
+
+
+class Profiles:
+    """The profiles of this process, in the factory that makes its participants."""
+
+    def __init__(self) -> None:
+        rmw = ctypes.CDLL(f"lib{get_rmw_implementation_identifier()}.so")
+        get_factory = getattr(rmw, GET_FACTORY)
+        get_factory.restype = ctypes.c_void_p
+        self._factory = ctypes.c_void_p(get_factory())
+        self._load_default = getattr(rmw, LOAD_DEFAULT)
+        self._load_string = getattr(rmw, LOAD_STRING)
+        self._set_default = getattr(rmw, SET_DEFAULT)
+        self._load_default.argtypes = [ctypes.c_void_p]
+        self._load_string.argtypes = [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_size_t]
+        self._set_default.argtypes = [ctypes.c_void_p, ctypes.c_void_p]
+        for function in (self._load_default, self._load_string, self._set_default):
+            function.restype = ctypes.c_uint32
+        self._qos_default = ctypes.addressof(ctypes.c_char.in_dll(rmw, QOS_DEFAULT))
+
+    def load(self, text: str) -> bool:
+        """Add the profiles in a text, and use its default profile from now on, if it has one.
+
+        Returns:
+            Whether Fast DDS has accepted them.
+        """
+        data = text.encode()
+        # It reads the user's files before the first participant. Read later, their default profile
+        # would replace this one.
+        self._load_default(self._factory)
+        if self._load_string(self._factory, data, len(data)) != 0:
+            return False
+        return bool(self._set_default(self._factory, self._qos_default) == 0)
+
+
+def load_profiles(text: str) -> bool:
+    """Add profiles to those of this process, at any time.
+
+    Entities that exist keep what they have.
+
+    Args:
+        text: the profiles, in XML. Their names must be new.
+
+    Returns:
+        Whether Fast DDS has accepted them; False also if this middleware has none.
+    """
+    profiles = _load_profiles()
+    return profiles is not None and profiles.load(text)
+
+
+@cache
+def _load_profiles() -> Profiles | None:
+    try:
+        return Profiles()
+    except (OSError, AttributeError, ValueError):
+        return None
 
 
 @cache

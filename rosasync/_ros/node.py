@@ -31,7 +31,7 @@ from rosasync._core.ports import (
     SubscriptionPort,
     TopicQos,
 )
-from rosasync._ros import discovery, names, profile, rcl
+from rosasync._ros import configuration, discovery, names, profile, rcl
 from rosasync._ros.direct_bridge import DirectBridge
 from rosasync._ros.executor_bridge import ExecutorBridge
 from rosasync._ros.executor_thread import ExecutorThread, ThreadUser, executor_thread_of
@@ -335,14 +335,14 @@ class RosNode:
         if "fastrtps" not in rclpy.get_rmw_implementation_identifier():
             return Node(name, context=context)
         domain = context.get_domain_id()
-        has_participant = bool(discovery.own_ports(domain))
-        if given is None or not has_participant:
-            check_ports(domain)
         if given is not None:
+            if not discovery.own_ports(domain):
+                check_ports(domain)
             return Node(name, context=context)
-        # The first node of a context makes its participant. Fast DDS reads its profiles when a
-        # process makes its first participant.
-        with profile.applied(first=not has_participant), _introduced(domain):
+        check_ports(domain)
+        configuration.configure(domain)
+        # The first node of a context makes its participant.
+        with _introduced(domain):
             return Node(name, context=context)
 
     def _make_bridge(self, options: SessionOptions, librcl: rcl.Rcl | None) -> Bridge:
@@ -366,7 +366,7 @@ class RosNode:
         return DirectBridge(self._node, librcl, self._loop, self._introspect, options.busy_poll)
 
     def _client_depth(self) -> int:
-        if profile.heartbeats():
+        if configuration.heartbeats():
             return names.DEPTH
         return max(names.DEPTH_WITHOUT_HEARTBEATS, self._in_flight)
 

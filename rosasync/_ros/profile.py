@@ -5,35 +5,28 @@ On Jazzy it also moves the middleware's errors from stdout to stderr, where Kilt
 Fast DDS repairs a lost packet when the writer's next heartbeat shows the reader the gap, and sends
 heartbeats every 3 s. rmw_fastrtps creates writers of requests with the profile named ``client``
 and those of responses with the profile named ``service``, so a profile with these two names
-reaches services and nothing else. Fast DDS reads profiles once, before the first participant of a
-process.
+reaches services and nothing else. A default profile for participants chooses the port at which
+the next one receives messages (`rosasync._ros.fresh_ports`).
 """
 
 from __future__ import annotations
 
-import contextlib
-import logging
 import os
-from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from xml.etree import ElementTree
 
 __all__ = [
     "HEARTBEAT",
     "SWITCH",
-    "applied",
-    "heartbeats",
     "is_old",
     "missing_heartbeats",
+    "participant_text",
     "profile_text",
     "profile_variable",
     "switched_off",
     "user_profile",
 ]
-
-logger = logging.getLogger("rosasync")
 
 HEARTBEAT = 0.02
 """Seconds between the heartbeats of a writer with unacknowledged samples."""
@@ -64,10 +57,16 @@ WRITER = """  <!-- {what}: repair a lost packet after {milliseconds} ms instead 
     <sec>{seconds}</sec><nanosec>{nanoseconds}</nanosec>
   </{tag}></times></publisher>
 """
-PARTICIPANT = """  <!-- Announce every process each {milliseconds} ms instead of 3 s. -->
-  <participant profile_name="rosasync" is_default_profile="true"><rtps><builtin><discovery_config>
-    <leaseAnnouncement><sec>{seconds}</sec><nanosec>{nanoseconds}</nanosec></leaseAnnouncement>
-  </discovery_config></builtin></rtps></participant>
+PARTICIPANT = """  <participant profile_name="{name}" is_default_profile="true"><rtps>
+{settings}  </rtps></participant>
+"""
+ANNOUNCE = """    <!-- Announce every process each {milliseconds} ms instead of 3 s. -->
+    <builtin><discovery_config><leaseAnnouncement>
+      <sec>{seconds}</sec><nanosec>{nanoseconds}</nanosec>
+    </leaseAnnouncement></discovery_config></builtin>
+"""
+PORT = """    <!-- Receive messages at ports that no dead process of this host has left behind. -->
+    <port><offsetd3>{offset}</offsetd3></port>
 """
 
 
@@ -95,6 +94,7 @@ def profile_text(
     names: tuple[str, ...] = NAMES,
     heartbeat: float = HEARTBEAT,
     announcement: float | None = None,
+    offset: int | None = None,
 ) -> str:
     """Return a profile in XML.
 
@@ -104,15 +104,22 @@ def profile_text(
         heartbeat: seconds between heartbeats.
         announcement: seconds between the announcements of a process; None to leave them as they
             are.
+        offset: what the first process adds to its metatraffic port for its messages, less 10
+            (``offsetd3``); None to leave it as it is.
     """
     tag = "heartbeatPeriod" if old else "heartbeat_period"
     what = {"client": "Requests", "service": "Responses"}
     profiles = [
         WRITER.format(what=what[name], name=name, tag=tag, **_duration(heartbeat)) for name in names
     ]
-    if announcement is not None:
-        profiles.append(PARTICIPANT.format(**_duration(announcement)))
+    if announcement is not None or offset is not None:
+        profiles.append(_participant("rosasync", announcement, offset))
     return PROFILE.format(profiles="".join(profiles), log=LOG if old else "")
+
+
+def participant_text(name: str, offset: int) -> str:
+    """Return a default profile for participants alone, with this name and ``offsetd3``."""
+    return PROFILE.format(profiles=_participant(name, None, offset), log="")
 
 
 def user_profile(old: bool) -> Path | None:
@@ -141,83 +148,13 @@ def missing_heartbeats(text: str) -> list[str]:
     return [name for name in NAMES if name not in present]
 
 
-def heartbeats() -> bool:
-    """Return whether the requests of this process have frequent heartbeats."""
-    return _State.applied or _user_heartbeats()
-
-
-@contextlib.contextmanager
-def applied(*, first: bool) -> Iterator[None]:
-    """Let Fast DDS find the profile when the block makes a participant.
-
-    Environment and file are gone afterwards: a child process configures itself. Does nothing if
-    the user has a profile or switched this one off.
-
-    Args:
-        first: whether it is the first participant of the process. Later ones use what Fast DDS
-            has read then.
-    """
-    old = is_old()
-    if switched_off() or _State.applied:
-        yield
-    elif file := user_profile(old):
-        _report_missing(file)
-        yield
-    elif not first:
-        # Each process says it once.
-        report = logger.debug if _State.reported else logger.info
-        _State.reported = True
-        report(
-            "Fast DDS has read its profiles before this session, so a lost request is repaired "
-            "after 3 s; `rosasync profile` prints what to set in the environment",
-        )
-        yield
-    else:
-        with TemporaryDirectory(prefix="rosasync-") as folder:
-            file = Path(folder, "profile.xml")
-            file.write_text(profile_text(old))
-            with _environment(profile_variable(old), str(file)):
-                yield
-        _State.applied = True
-
-
-class _State:
-    applied = False
-    """Whether Fast DDS has read rosasync's profile in this process."""
-    reported = False
-    """Whether the log says why it has not."""
-
-
-def _user_heartbeats() -> bool:
-    file = user_profile(is_old())
-    try:
-        return file is not None and "client" not in missing_heartbeats(file.read_text())
-    except (OSError, ValueError, ElementTree.ParseError):
-        return False
-
-
-@contextlib.contextmanager
-def _environment(name: str, value: str) -> Iterator[None]:
-    os.environ[name] = value
-    try:
-        yield
-    finally:
-        os.environ.pop(name, None)
-
-
-def _report_missing(file: Path) -> None:
-    try:
-        missing = missing_heartbeats(file.read_text())
-    except (OSError, ValueError, ElementTree.ParseError) as error:
-        logger.info("the Fast DDS profile %s cannot be read: %s", file, error)
-        return
-    if missing:
-        logger.info(
-            "the Fast DDS profile %s sets no heartbeat period for the publishers %s, so a lost "
-            "request or response is repaired after 3 s; `rosasync profile` prints what to add",
-            file,
-            " and ".join(repr(name) for name in missing),
-        )
+def _participant(name: str, announcement: float | None, offset: int | None) -> str:
+    settings = ""
+    if announcement is not None:
+        settings += ANNOUNCE.format(**_duration(announcement))
+    if offset is not None:
+        settings += PORT.format(offset=offset)
+    return PARTICIPANT.format(name=name, settings=settings)
 
 
 def _duration(seconds: float) -> dict[str, int]:

@@ -9,12 +9,12 @@ import time
 from pathlib import Path
 
 from rosasync._ros.discovery import BASE, DOMAIN_GAIN
+from rosasync._ros.fresh_ports import FOLDER, port_prefix
 from rosasync._ros.profile import is_old, user_profile
 from rosasync.errors import RosasyncError
 
 __all__ = ["FOLDER", "check_ports", "describe_unfinished", "removal_command", "unfinished_ports"]
 
-FOLDER = Path("/dev/shm")
 READY = 2
 """The first word of a segment that boost has initialised (``managed_open_or_create_impl.hpp``)."""
 GRACE = 2.0
@@ -39,7 +39,7 @@ def unfinished_ports(domain: int) -> list[Path]:
     """
     if not _uses_shared_memory():
         return []
-    prefix = "fastrtps_port" if is_old() else "fastdds_port"
+    prefix = port_prefix()
     own = range(BASE + DOMAIN_GAIN * domain, BASE + DOMAIN_GAIN * (domain + 1))
     found = [
         file

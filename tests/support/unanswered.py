@@ -1,4 +1,7 @@
-"""A process that sends one request to a server that does not read it: ``session`` or ``stock``."""
+"""A process that sends one request to a server that does not read it.
+
+It is a ``session``, a ``late session`` after a stock node, or ``stock``.
+"""
 
 from __future__ import annotations
 
@@ -44,6 +47,12 @@ def call_stock() -> None:
     rclpy.shutdown()
 
 
+def make_node() -> None:
+    rclpy.init(domain_id=1)
+    rclpy.create_node("before").destroy_node()
+    rclpy.shutdown()
+
+
 async def call_session() -> None:
     async with rosasync.Session("first"):
         pass
@@ -61,7 +70,9 @@ async def call_session() -> None:
 if __name__ == "__main__":
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     GIVEN = set(os.environ)
-    if sys.argv[1] == "session":
+    if sys.argv[1].startswith("late"):
+        make_node()
+    if sys.argv[1].endswith("session"):
         asyncio.run(call_session())
     elif sys.argv[1] == "stock":
         call_stock()
