@@ -9,6 +9,7 @@ from rosasync._client.pool import ClientPool, LeasedClient
 from rosasync._core.futures import wrap_future
 from rosasync._core.portal import Portal
 from rosasync._core.proxy import AsyncServiceProxy, ProxyState
+from rosasync._ros.json_schema import json_schema
 from rosasync._ros.messages import to_dict, to_message
 from rosasync._server.server import RequestInfo, ServiceCall, ServiceServer
 from rosasync.errors import (
@@ -90,6 +91,7 @@ __all__ = [
     "Trace",
     "TracedCall",
     "UsageError",
+    "json_schema",
     "to_dict",
     "to_message",
     "wrap_future",

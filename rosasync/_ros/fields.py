@@ -10,6 +10,8 @@ A value comes from one of two places, and what is taken from each differs a litt
 from __future__ import annotations
 
 import array
+import base64
+import binascii
 import copy
 import difflib
 import importlib
@@ -29,6 +31,7 @@ from rosasync._ros.types import hint, shown, type_name
 __all__ = [
     "BoolField",
     "ByteField",
+    "BytesField",
     "CharField",
     "Field",
     "FieldType",
@@ -44,8 +47,11 @@ __all__ = [
     "field_types",
     "fields_of",
     "fit",
+    "json_fields",
     "plain_fields",
 ]
+
+_NOT_FINITE = frozenset({"NaN", "Infinity", "-Infinity"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +114,10 @@ class Field(ABC):
     def to_plain(self, value: Any) -> Any:
         """Return a value of a message as `to_dict` does."""
         return value
+
+    def to_json(self, value: Any) -> Any:
+        """Return a value of a message as `to_dict` does for JSON."""
+        return self.to_plain(value)
 
     def describe(self) -> FieldType:
         """Return the type of the field."""
@@ -190,6 +200,8 @@ class FloatField(Field):
                 number = float(value)
             except OverflowError:
                 raise self._out_of_range(value) from None
+        elif isinstance(value, str) and value in _NOT_FINITE:
+            return float(value)
         else:
             raise self.refuse(value)
         if abs(number) > self.limit and not math.isinf(number):
@@ -197,11 +209,16 @@ class FloatField(Field):
         return number
 
     def fit(self, value: Any) -> Any:
+        if isinstance(value, str):
+            raise self.refuse(value)
         converted = self.to_ros(value)
         return value if isinstance(value, float) else converted
 
     def to_plain(self, value: Any) -> float:
         return float(value)
+
+    def to_json(self, value: Any) -> float | str:
+        return float(value) if math.isfinite(value) else _name_of(value)
 
     def describe(self) -> FieldType:
         return FieldType(self.label, "float")
@@ -225,6 +242,9 @@ class ByteField(Field):
         if not isinstance(value, numbers.Integral) or isinstance(value, bool):
             raise self.refuse(value)
         return bytes((_UINT8.to_ros(value),))
+
+    def to_json(self, value: Any) -> int:
+        return int(value[0])
 
     def describe(self) -> FieldType:
         return FieldType(self.label, "byte")
@@ -296,6 +316,9 @@ class MessageField(Field):
     def to_plain(self, value: Any) -> dict[str, Any]:
         return plain_fields(value)
 
+    def to_json(self, value: Any) -> dict[str, Any]:
+        return json_fields(value)
+
     def describe(self) -> FieldType:
         return FieldType(self.label, "message", message_type=self.message_type)
 
@@ -337,6 +360,9 @@ class SequenceField(Field):
     def to_plain(self, value: Any) -> Any:
         return [self.element.to_plain(item) for item in value]
 
+    def to_json(self, value: Any) -> Any:
+        return [self.element.to_json(item) for item in value]
+
     def describe(self) -> FieldType:
         return FieldType(self.label, "sequence", element=self.element.describe())
 
@@ -354,6 +380,15 @@ class SequenceField(Field):
         if not isinstance(items, list):
             raise self.refuse(value)
         return items
+
+    def decode(self, text: str) -> bytes:
+        """Return the bytes that JSON has as base64."""
+        try:
+            return base64.b64decode(text, validate=True)
+        except (binascii.Error, ValueError):  # ValueError: not ASCII
+            refused = self.refuse(text)
+            refused.problem += ", which is not base64"
+            raise refused from None
 
     def check_size(self, size: int) -> None:
         """Raise unless this many elements fit."""
@@ -394,16 +429,32 @@ class NumbersField(SequenceField):
     def to_plain(self, value: Any) -> Any:
         return array.array(self.typecode, value).tolist()
 
+    def to_json(self, value: Any) -> Any:
+        plain = self.to_plain(value)
+        if self.typecode in "fd" and not all(map(math.isfinite, plain)):
+            return [self.element.to_json(item) for item in plain]
+        return plain
+
 
 class BytesField(NumbersField):
+    """Numbers of type uint8."""
+
+    def to_ros(self, value: object) -> Any:
+        return super().to_ros(self.decode(value) if isinstance(value, str) else value)
+
     def to_plain(self, value: Any) -> bytes:
         return bytes(value)
+
+    def to_json(self, value: Any) -> str:
+        return _base64(self.to_plain(value))
 
 
 class OctetsField(SequenceField):
     """Bytes, which rclpy represents as a list of bytes of length 1."""
 
     def to_ros(self, value: object) -> Any:
+        if isinstance(value, str):
+            value = self.decode(value)
         packed = _buffer(value, ("B",))
         if packed is None:
             return super().to_ros(value)
@@ -414,10 +465,24 @@ class OctetsField(SequenceField):
         if isinstance(value, bytes | bytearray) and not self.least:
             self.check_size(len(value))
             return value
+        if isinstance(value, str):
+            raise self.refuse(value)
         return super().fit(value)
 
     def to_plain(self, value: Any) -> bytes:
         return bytes(value) if isinstance(value, bytes | bytearray) else b"".join(value)
+
+    def to_json(self, value: Any) -> str:
+        return _base64(self.to_plain(value))
+
+
+def _base64(value: bytes) -> str:
+    return base64.b64encode(value).decode()
+
+
+def _name_of(value: float) -> str:
+    """Return the text by which JSON has a number that it cannot write."""
+    return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
 
 
 def _formats_like(typecode: str) -> tuple[str, ...]:
@@ -510,6 +575,12 @@ def plain_fields(message: Any) -> dict[str, Any]:
     return {name: field.to_plain(getattr(message, name)) for name, field in fields.items()}
 
 
+def json_fields(message: Any) -> dict[str, Any]:
+    """Return the fields of a message as values of JSON."""
+    fields = fields_of(type(message))
+    return {name: field.to_json(getattr(message, name)) for name, field in fields.items()}
+
+
 def _no_such_field(message_type: type[Any], name: object) -> InvalidField:
     fields = fields_of(message_type)
     similar = hint(difflib.get_close_matches(str(name), fields, n=1), fields)
@@ -526,9 +597,11 @@ def fields_of(message_type: type[Any]) -> dict[str, Field]:
     Raises:
         TypeError: not a message class.
     """
+    if not isinstance(message_type, type):
+        raise TypeError(f"{shown(message_type)} is not a message type")
     fields = _known.get(message_type)
     if fields is None:
-        if not isinstance(message_type, type) or not hasattr(message_type, "SLOT_TYPES"):
+        if not hasattr(message_type, "SLOT_TYPES"):
             raise TypeError(f"{shown(message_type)} is not a message type")
         # A subclass of the user may need arguments to be created.
         generated: Any = next(base for base in message_type.__mro__ if "SLOT_TYPES" in vars(base))

@@ -113,6 +113,8 @@ def _module(package: str, kind: str, interface: str) -> Any:
 @functools.cache
 def _comments(message: str) -> dict[str, str]:
     """Return the comments of the fields, as far as the definition of the type is installed."""
+    if message.count("/") != 2:  # not from ROS
+        return {}
     package, kind, name = message.split("/")
     base, _, part = name.partition("_")
     for prefix in prefixes():

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from rosasync._ros.checks import checker
-from rosasync._ros.fields import InvalidField, build, fit, plain_fields
+from rosasync._ros.fields import InvalidField, build, fit, json_fields, plain_fields
 from rosasync._ros.types import shown, type_name
 
 __all__ = ["make_message", "to_dict", "to_message"]
@@ -57,6 +57,9 @@ def to_message(message_type: type[Any], mapping: Mapping[str, Any]) -> Any:
     uint8 and byte []   bytes and bytearray as well
     ==================  ===========================================================================
 
+    The JSON of ``to_dict(message, json=True)`` is taken as well: base64 for the elements of uint8
+    and byte, and the texts "NaN", "Infinity" and "-Infinity" for floats.
+
     Raises:
         TypeError: a value of the wrong kind; the message names the path of the field.
         ValueError: no such field, a value out of its range, or a wrong number of elements; the
@@ -69,18 +72,25 @@ def to_message(message_type: type[Any], mapping: Mapping[str, Any]) -> Any:
     return _convert(build, message_type, mapping)
 
 
-def to_dict(message: object) -> dict[str, Any]:
+def to_dict(message: object, json: bool = False) -> dict[str, Any]:
     """Return the fields of a message as plain Python values, which `to_message` accepts.
 
     Nested messages become dicts, and arrays and sequences become lists, but those of uint8 and
     byte become bytes. A single byte stays bytes of length 1, like the constants of its type.
+
+    Args:
+        message: the message.
+        json: return values of JSON, which fit `json_schema`. They differ in three kinds, and are
+            those of protobuf's JSON: arrays and sequences of uint8 and byte become base64, a
+            single byte becomes a number, and NaN and the infinities become "NaN", "Infinity" and
+            "-Infinity".
 
     Raises:
         TypeError: not a message.
     """
     if isinstance(message, type):
         raise TypeError(f"expected a message, got {shown(message)}")
-    return plain_fields(message)
+    return json_fields(message) if json else plain_fields(message)
 
 
 def _convert(function: Callable[[type[Any], Any], Any], message_type: type[Any], value: Any) -> Any:
