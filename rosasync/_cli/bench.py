@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import AsyncIterator
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from rosasync._cli.graph import find_type, srv_class
-from rosasync._cli.load import Tally, make_calls, percentile
+from rosasync._cli.histogram import histogram
+from rosasync._cli.load import Tally, make_calls
 from rosasync._cli.options import AsJson, Name, OptionalType, OptionalYaml
 from rosasync._cli.output import console, print_json, progress
 from rosasync._cli.requests import message_from, split_type
 from rosasync._cli.run import open_session, run
 
-if TYPE_CHECKING:
-    from rich.table import Table
-
 __all__ = ["bench"]
 
-BINS, BAR = 12, 40
+BAR = 40
+"""The width of the longest bar."""
 LATEST = 2000
 """Calls that the percentiles shown while it runs are of: sorting all would be measured too."""
 
@@ -107,22 +105,4 @@ def _print(tally: Tally, as_json: bool) -> None:
         return
     print("\n".join(tally.lines()))
     if tally.latencies:
-        console().print(_histogram(sorted(tally.latencies)))
-
-
-def _histogram(ordered: list[float]) -> Table:
-    """Return the histogram of sorted latencies, with logarithmic bins up to the 99th percentile."""
-    from rich.bar import Bar
-    from rich.table import Table
-
-    low, high = ordered[0], percentile(ordered, 99) or ordered[0]
-    edges = [low * (high / low) ** (n / BINS) for n in range(BINS)] if high > low else [low]
-    ends = [*edges[1:], math.inf]
-    counts = [sum(edge <= s < end for s in ordered) for edge, end in zip(edges, ends, strict=True)]
-    table = Table(box=None, show_header=False)
-    table.add_column(justify="right")
-    table.add_column(justify="right")
-    for edge, count in zip(edges, counts, strict=True):
-        bar = Bar(max(counts), 0, count, width=BAR)
-        table.add_row(f"from {1e3 * edge:.3f} ms", f"{count}", bar)
-    return table
+        console().print(histogram({"": tally.latencies}, BAR))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import math
 import time
 from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable
@@ -12,8 +11,9 @@ from typing import Any
 
 import rosasync
 from rosasync._cli.errors import Code, code_of
+from rosasync._cli.histogram import percentile
 
-__all__ = ["Tally", "make_calls", "milliseconds", "percentile"]
+__all__ = ["Tally", "make_calls", "milliseconds"]
 
 
 @dataclass
@@ -103,13 +103,6 @@ class Tally:
             names = ("p50", "p90", "p99", "max")
             lines.append(", ".join(f"{name} {shown[f'{name}_ms']:g} ms" for name in names))
         return lines
-
-
-def percentile(ordered: list[float], percent: int) -> float | None:
-    """Return a percentile of sorted values, None if there are none."""
-    if not ordered:
-        return None
-    return ordered[max(0, math.ceil(percent / 100 * len(ordered)) - 1)]
 
 
 def milliseconds(seconds: float | None) -> float | None:

@@ -1,11 +1,10 @@
-"""``rosasync demo``: rosasync compared with threaded ``client.call``, on a stock rclpy server."""
+"""``rosasync demo``: rosasync compared with threaded ``client.call``, on two stock servers."""
 
 from __future__ import annotations
 
 import asyncio
 import io
 import json
-import math
 import platform
 import statistics
 import sys
@@ -13,16 +12,16 @@ import threading
 import time
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import AsyncExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
-from rich.bar import Bar
 from rich.console import Console, Group
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 import rosasync
+from rosasync._cli.histogram import histogram, percentile
 from rosasync._demo.server import stock_server
 from rosasync._ros.domain import isolate
 
@@ -32,9 +31,9 @@ if TYPE_CHECKING:
 __all__ = ["DemoError", "Figures", "Report", "run_demo"]
 
 OURS, STOCK = "rosasync", "client.call"
-SRV_NAMES = {OURS: "/rosasync_demo/ours", STOCK: "/rosasync_demo/stock"}
-"""One name for each contestant: clients of the same name wake each other with their responses."""
-
+EXECUTOR, BARE = "executor", "bare loop"
+"""The servers: rclpy's executor calls a callback for each request; or a loop around one wait set,
+whose server is not the limit."""
 AT_ONCE = (1, 10)
 ROUNDS = 10
 WARM_UP = 20
@@ -42,8 +41,30 @@ CALL_TIMEOUT = 3.0
 GREETINGS, GREETING_TIMEOUT = 6, 0.5
 """The most attempts at a first call, and seconds for each attempt."""
 
-START_LIMIT = 8.0
+START_LIMIT = 15.0
 """Seconds for the start."""
+
+
+class Turn(NamedTuple):
+    """What is measured together: the calls of one contestant to one server."""
+
+    server: str
+    at_once: int
+    contestant: str
+
+    @property
+    def srv_name(self) -> str:
+        """The service. Clients of the same name would wake each other with their responses."""
+        server = "bare" if self.server == BARE else "stock"
+        return f"/rosasync_demo/{server}/{'ours' if self.contestant == OURS else 'threads'}"
+
+
+TURNS = [
+    Turn(server, at_once, contestant)
+    for server in (EXECUTOR, BARE)
+    for at_once in AT_ONCE
+    for contestant in (OURS, STOCK)
+]
 
 
 class DemoError(Exception):
@@ -97,7 +118,7 @@ class Samples:
         ordered = sorted(self.latencies)
         return Figures(
             median_us=round(1e6 * statistics.median(ordered), 2),
-            p99_us=round(1e6 * _percentile_99(ordered), 2),
+            p99_us=round(1e6 * (percentile(ordered, 99) or 0.0), 2),
             calls_per_s=round(calls / self.wall, 2),
             cpu_us_per_call=round(1e6 * self.cpu / calls, 2),
         )
@@ -105,57 +126,57 @@ class Samples:
 
 @dataclass(frozen=True)
 class Report:
-    """The results of the demo, by contestant and number of calls at once."""
+    """The results of the demo, by server, number of calls at once, and contestant."""
 
     bridge: str
-    samples: dict[tuple[str, int], Samples]
+    samples: dict[Turn, Samples]
 
     def as_json(self) -> str:
         """Return the figures and ratios as a JSON object."""
+        machine = {"python": platform.python_version(), "platform": platform.platform()}
+        contests = {"contests": self._contests(EXECUTOR), "bare_server": self._contests(BARE)}
+        return json.dumps({"bridge": self.bridge, **machine, **contests}, indent=2)
+
+    def as_text(self) -> Group:
+        """Return the table and the histogram for a rich console."""
+        latencies = {
+            name: self.samples[Turn(EXECUTOR, 1, name)].latencies for name in (OURS, STOCK)
+        }
+        title = "\nLatency of one call at a time, with the executor as server"
+        return Group(self._table(), title, histogram(latencies, 24), self._legend())
+
+    def _contests(self, server: str) -> list[dict[str, object]]:
         contests = []
         for at_once in AT_ONCE:
             contest: dict[str, object] = {"at_once": at_once}
             for name in (OURS, STOCK):
-                samples = self.samples[name, at_once]
+                samples = self.samples[Turn(server, at_once, name)]
                 contest[name] = {"calls": len(samples.latencies), **asdict(samples.figures())}
-            contests.append({**contest, "ratio": self._ratios(at_once)})
-        machine = {"python": platform.python_version(), "platform": platform.platform()}
-        return json.dumps({"bridge": self.bridge, **machine, "contests": contests}, indent=2)
-
-    def as_text(self) -> Group:
-        """Return the table and the histogram for a rich console."""
-        return Group(self._table(), "", self._histogram(), self._legend())
+            contests.append({**contest, "ratio": self._ratios(server, at_once)})
+        return contests
 
     def _table(self) -> Table:
-        table = Table(title="The same service calls, to the same stock rclpy server")
-        table.add_column("calls at once", justify="right")
-        table.add_column("made with")
-        for heading in ("median", "99 %", "calls/s", "CPU per call"):
-            table.add_column(heading, justify="right")
-        for at_once in AT_ONCE:
-            ours, stock = (self.samples[name, at_once].figures() for name in (OURS, STOCK))
-            ratios = (f"{ratio:.2f}" for ratio in self._ratios(at_once).values())
-            table.add_row(str(at_once), OURS, *_cells(ours), style="bold")
-            table.add_row("", STOCK, *_cells(stock))
-            table.add_row("", "ratio", *ratios, end_section=True)
+        table = Table(title="The same service calls, to the same stock rclpy servers")
+        table.add_column("server", no_wrap=True)
+        table.add_column("at once", justify="right")
+        table.add_column("made with", no_wrap=True)
+        for heading in ("median", "99 %", "calls/s", "CPU/call"):
+            table.add_column(heading, justify="right", no_wrap=True)
+        for server in (EXECUTOR, BARE):
+            for at_once in AT_ONCE:
+                ours, stock = (
+                    self.samples[Turn(server, at_once, name)].figures() for name in (OURS, STOCK)
+                )
+                ratios = (f"{ratio:.2f}" for ratio in self._ratios(server, at_once).values())
+                table.add_row(server, str(at_once), OURS, *_cells(ours), style="bold")
+                table.add_row("", "", STOCK, *_cells(stock))
+                table.add_row("", "", "ratio", *ratios, end_section=True)
         return table
 
-    def _histogram(self) -> Table:
-        ours, stock = (self.samples[name, 1].latencies for name in (OURS, STOCK))
-        edges = _edges([*ours, *stock], bins=12)
-        shares = [_shares(latencies, edges) for latencies in (ours, stock)]
-        longest = max(max(column) for column in shares)
-        table = Table(title="Latency, one call at a time", box=None)
-        table.add_column("from", justify="right")
-        for name in (OURS, STOCK):
-            table.add_column(name, width=28)
-        for edge, *row in zip(edges, *shares, strict=True):
-            bars = (Bar(longest, 0, share, width=28) for share in row)
-            table.add_row(f"{1e6 * edge:,.0f} µs", *bars)
-        return table
-
-    def _ratios(self, at_once: int) -> dict[str, float]:
-        ours, stock = (self.samples[name, at_once].figures() for name in (OURS, STOCK))
+    def _ratios(self, server: str, at_once: int) -> dict[str, float]:
+        ours, stock = (
+            self.samples[Turn(server, at_once, name)].figures() for name in (OURS, STOCK)
+        )
         return ours.ratios(stock)
 
     def _legend(self) -> str:
@@ -164,6 +185,8 @@ class Report:
             f"\n{calls:,} calls, each with the right response."
             f"\n{OURS}: one session, on the {self.bridge} bridge."
             f"\n{STOCK}: threads, with a SingleThreadedExecutor in another thread."
+            f"\n{EXECUTOR}: a stock server, with a SingleThreadedExecutor, which is soon the limit."
+            f"\n{BARE}: a server that does the least, so that the client is the limit."
             "\nCPU: the time of the calling process, in all threads."
             f"\nratio: {OURS} / {STOCK}."
         )
@@ -178,33 +201,14 @@ def _cells(figures: Figures) -> tuple[str, ...]:
     )
 
 
-def _percentile_99(ordered: list[float]) -> float:
-    return ordered[math.ceil(0.99 * len(ordered)) - 1]
-
-
-def _edges(latencies: list[float], bins: int) -> list[float]:
-    """Return the lower edges of logarithmic bins, up to the 99th percentile."""
-    ordered = sorted(latencies)
-    low, high = ordered[0], _percentile_99(ordered)
-    return [low * (high / low) ** (n / bins) for n in range(bins + 1)]
-
-
-def _shares(latencies: list[float], edges: list[float]) -> list[float]:
-    """Return the share of latencies in each bin; the last bin has no upper edge."""
-    ends = [*edges[1:], math.inf]
-    return [
-        sum(low <= latency < high for latency in latencies) / len(latencies)
-        for low, high in zip(edges, ends, strict=True)
-    ]
-
-
 async def run_demo(*, calls: int = 2000, seconds: float = 8.0, as_json: bool = False) -> None:
     """Run the demo and print the results to standard output; progress goes to standard error.
 
     It moves the process into an unused ROS domain.
 
     Args:
-        calls: number of calls of each contestant one at a time, and again ten at once.
+        calls: number of calls of each contestant to each server, one at a time and again ten at
+            once.
         seconds: seconds to measure at most; if they run out, fewer calls are made.
         as_json: print a JSON object instead of a table and a histogram.
 
@@ -229,75 +233,140 @@ async def run_demo(*, calls: int = 2000, seconds: float = 8.0, as_json: bool = F
 
 
 async def _run(calls: int, seconds: float) -> Report:
+    stock_names, bare_names = (
+        sorted({turn.srv_name for turn in TURNS if turn.server == server})
+        for server in (EXECUTOR, BARE)
+    )
     async with (
         asyncio.timeout(START_LIMIT + seconds),
         rosasync.Session("rosasync_demo", timeout=CALL_TIMEOUT) as session,
-        stock_server(*SRV_NAMES.values()) as ready,
+        AsyncExitStack() as stack,
     ):
-        if not ready:
+        servers = stock_server(*stock_names), stock_server(*bare_names, bare=True)
+        # At once, because each takes a second to start.
+        if not all(await asyncio.gather(*map(stack.enter_async_context, servers))):
             raise DemoError("the server process ended before it was ready")
-        from rosasync._demo.stock import Echo
-
-        with _stock_client() as client, ThreadPoolExecutor(max(AT_ONCE)) as threads:
-            await session.wait_for_service(Echo, SRV_NAMES[OURS], timeout=START_LIMIT)
-            if not await asyncio.to_thread(client.wait_for_service, START_LIMIT):
-                raise DemoError(f"{STOCK} did not find the server")
-            await _greet(session, client)
-            contestants = _Contestants(session, client, threads)
+        with _Contestants(session) as contestants:
+            await contestants.find_servers()
             return Report(session.bridge, await _measure(contestants, calls, seconds))
 
 
-async def _greet(session: rosasync.Session, client: ThreadedClient) -> None:
-    """Make the first calls, with retries: the server may not have discovered the clients yet."""
-    from rosasync._demo.stock import Echo, request_for
-
-    greeting = request_for("hello")
-    retry = rosasync.Retry(attempts=GREETINGS, after=GREETING_TIMEOUT, backoff=1.0)
-    await session.call(Echo, SRV_NAMES[OURS], greeting, retry=retry, timeout=START_LIMIT)
-    for _ in range(GREETINGS):
-        with suppress(TimeoutError):
-            await asyncio.to_thread(client.call, greeting, GREETING_TIMEOUT)
-            return
-    raise DemoError(f"{STOCK} got no response")
-
-
-@contextmanager
-def _stock_client() -> Iterator[ThreadedClient]:
-    from rosasync._demo.stock import ThreadedClient
-
-    client = ThreadedClient(SRV_NAMES[STOCK])
-    try:
-        yield client
-    finally:
-        client.close()
-
-
-@dataclass(frozen=True)
 class _Contestants:
-    session: rosasync.Session
-    client: ThreadedClient
-    threads: ThreadPoolExecutor
+    """The session, and a stock client with its threads for each server."""
+
+    def __init__(self, session: rosasync.Session) -> None:
+        self._session = session
+        self._threads = ThreadPoolExecutor(max(AT_ONCE))
+        self._clients: dict[str, ThreadedClient] = {}
+
+    def __enter__(self) -> _Contestants:
+        from rosasync._demo.stock import ThreadedClient
+
+        try:
+            for turn in TURNS:
+                if turn.contestant == STOCK and turn.srv_name not in self._clients:
+                    self._clients[turn.srv_name] = ThreadedClient(turn.srv_name)
+        except BaseException:
+            self.__exit__()
+            raise
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._threads.shutdown()
+        for client in self._clients.values():
+            client.close()
+
+    async def find_servers(self) -> None:
+        """Make the first calls, with retries: a server may not have discovered its clients yet."""
+        from rosasync._demo.stock import Echo, request_for
+
+        greeting = request_for("hello")
+        retry = rosasync.Retry(attempts=GREETINGS, after=GREETING_TIMEOUT, backoff=1.0)
+        for name in {turn.srv_name for turn in TURNS if turn.contestant == OURS}:
+            await self._session.call(Echo, name, greeting, retry=retry, timeout=START_LIMIT)
+        for client in self._clients.values():
+            if not await asyncio.to_thread(client.wait_for_service, START_LIMIT):
+                raise DemoError(f"{STOCK} did not find the server")
+            await self._greet(client)
+
+    async def _greet(self, client: ThreadedClient) -> None:
+        from rosasync._demo.stock import request_for
+
+        for _ in range(GREETINGS):
+            with suppress(TimeoutError):
+                await asyncio.to_thread(client.call, request_for("hello"), GREETING_TIMEOUT)
+                return
+        raise DemoError(f"{STOCK} got no response")
+
+    async def call_ours(
+        self, turn: Turn, shares: Iterable[range], until: float, latencies: list[float]
+    ) -> None:
+        """Make the calls of a turn with a task for each share."""
+        from rosasync._demo.stock import Echo, answer_of, request_for
+
+        async def caller(numbers: range) -> None:
+            for number in numbers:
+                start = time.perf_counter()
+                request = request_for(str(number))
+                response = await self._session.call(Echo, turn.srv_name, request)
+                now = time.perf_counter()
+                latencies.append(now - start)
+                _check(answer_of(response), str(number))
+                if now > until:
+                    return
+
+        try:
+            async with asyncio.TaskGroup() as group:
+                for numbers in shares:
+                    group.create_task(caller(numbers))
+        except ExceptionGroup as errors:
+            raise errors.exceptions[0] from None
+
+    async def call_stock(
+        self, turn: Turn, shares: Iterable[range], until: float, latencies: list[float]
+    ) -> None:
+        """Make the calls of a turn with a thread for each share."""
+        from rosasync._demo.stock import answer_of, request_for
+
+        client = self._clients[turn.srv_name]
+        stop = threading.Event()
+
+        def caller(numbers: range) -> None:
+            for number in numbers:
+                start = time.perf_counter()
+                request = request_for(str(number))
+                response = client.call(request, CALL_TIMEOUT)
+                now = time.perf_counter()
+                latencies.append(now - start)
+                _check(answer_of(response), str(number))
+                if now > until or stop.is_set():
+                    return
+
+        loop = asyncio.get_running_loop()
+        try:
+            await asyncio.gather(
+                *(loop.run_in_executor(self._threads, caller, numbers) for numbers in shares)
+            )
+        finally:
+            stop.set()
 
 
-async def _measure(
-    contestants: _Contestants, calls: int, seconds: float
-) -> dict[tuple[str, int], Samples]:
+async def _measure(contestants: _Contestants, calls: int, seconds: float) -> dict[Turn, Samples]:
     """Alternate between the contestants; each turn gets an equal share of the remaining time."""
-    samples = {(name, at_once): Samples() for at_once in AT_ONCE for name in (OURS, STOCK)}
-    turns = [turn for _ in range(ROUNDS) for turn in samples]
+    samples = {turn: Samples() for turn in TURNS}
+    turns = [turn for _ in range(ROUNDS) for turn in TURNS]
     end = time.perf_counter() + seconds
-    for name, at_once in samples:
-        await _take_turn(contestants, name, at_once, WARM_UP, end, Samples())
+    for turn in TURNS:
+        await _take_turn(contestants, turn, WARM_UP, end, Samples())
     with _progress() as progress:
         task = progress.add_task("", total=len(turns))
-        for done, (name, at_once) in enumerate(turns):
-            progress.update(task, completed=done, description=f"{name}, {at_once} at once")
+        for done, turn in enumerate(turns):
+            shown = f"{turn.contestant}, {turn.server}, {turn.at_once} at once"
+            progress.update(task, completed=done, description=shown)
             progress.refresh()
             now = time.perf_counter()
             until = now + (end - now) / (len(turns) - done)
-            await _take_turn(
-                contestants, name, at_once, calls // ROUNDS, until, samples[name, at_once]
-            )
+            await _take_turn(contestants, turn, calls // ROUNDS, until, samples[turn])
     return samples
 
 
@@ -305,7 +374,7 @@ def _progress() -> Progress:
     # Refresh only between turns, because redrawing would be measured too.
     console = Console(stderr=True)
     return Progress(
-        TextColumn("{task.description:24}"),
+        TextColumn("{task.description:36}"),
         BarColumn(),
         TimeElapsedColumn(),
         console=console,
@@ -316,65 +385,14 @@ def _progress() -> Progress:
 
 
 async def _take_turn(
-    contestants: _Contestants, name: str, at_once: int, calls: int, until: float, into: Samples
+    contestants: _Contestants, turn: Turn, calls: int, until: float, into: Samples
 ) -> None:
-    """Make the calls with ``at_once`` callers; stop at ``until``, even if calls are left."""
-    calls = max(calls, at_once)
-    shares = [range(caller, calls, at_once) for caller in range(at_once)]
-    turn = _our_turn if name == OURS else _stock_turn
+    """Make the calls, ``turn.at_once`` at once; stop at ``until``, even if calls are left."""
+    calls = max(calls, turn.at_once)
+    shares = [range(caller, calls, turn.at_once) for caller in range(turn.at_once)]
+    call = contestants.call_ours if turn.contestant == OURS else contestants.call_stock
     with into.measure():
-        await turn(contestants, shares, until, into.latencies)
-
-
-async def _our_turn(
-    contestants: _Contestants, shares: Iterable[range], until: float, latencies: list[float]
-) -> None:
-    from rosasync._demo.stock import Echo, answer_of, request_for
-
-    async def caller(numbers: range) -> None:
-        for number in numbers:
-            start = time.perf_counter()
-            request = request_for(str(number))
-            response = await contestants.session.call(Echo, SRV_NAMES[OURS], request)
-            now = time.perf_counter()
-            latencies.append(now - start)
-            _check(answer_of(response), str(number))
-            if now > until:
-                return
-
-    try:
-        async with asyncio.TaskGroup() as group:
-            for numbers in shares:
-                group.create_task(caller(numbers))
-    except ExceptionGroup as errors:
-        raise errors.exceptions[0] from None
-
-
-async def _stock_turn(
-    contestants: _Contestants, shares: Iterable[range], until: float, latencies: list[float]
-) -> None:
-    from rosasync._demo.stock import answer_of, request_for
-
-    stop = threading.Event()
-
-    def caller(numbers: range) -> None:
-        for number in numbers:
-            start = time.perf_counter()
-            request = request_for(str(number))
-            response = contestants.client.call(request, CALL_TIMEOUT)
-            now = time.perf_counter()
-            latencies.append(now - start)
-            _check(answer_of(response), str(number))
-            if now > until or stop.is_set():
-                return
-
-    loop = asyncio.get_running_loop()
-    try:
-        await asyncio.gather(
-            *(loop.run_in_executor(contestants.threads, caller, numbers) for numbers in shares)
-        )
-    finally:
-        stop.set()
+        await call(turn, shares, until, into.latencies)
 
 
 def _check(answer: str, text: str) -> None:

@@ -1,4 +1,4 @@
-"""The stock server of the demo and of ``rosasync doctor``, in a process of its own."""
+"""The servers of the demo and of ``rosasync doctor``, each in a process of its own."""
 
 from __future__ import annotations
 
@@ -14,8 +14,12 @@ END_LIMIT = 1.5
 
 
 @asynccontextmanager
-async def stock_server(*srv_names: str) -> AsyncIterator[bool]:
+async def stock_server(*srv_names: str, bare: bool = False) -> AsyncIterator[bool]:
     """Run a stock server in its own process and session, so that Ctrl-C does not reach it.
+
+    Args:
+        srv_names: the services to serve.
+        bare: answer in a bare loop instead of an executor's callbacks.
 
     Yields:
         Whether it is ready. If not, its process has ended.
@@ -23,7 +27,7 @@ async def stock_server(*srv_names: str) -> AsyncIterator[bool]:
     from rosasync._demo.stock import READY
 
     process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "rosasync._demo.stock", *srv_names),
+        *(sys.executable, "-m", "rosasync._demo.stock", *(["--bare"] if bare else []), *srv_names),
         stdin=asyncio.subprocess.PIPE,
         stdout=asyncio.subprocess.PIPE,
         start_new_session=True,

@@ -1,6 +1,7 @@
 """The plain rclpy peers of the demo: a server process and threaded ``client.call``.
 
-``python -m rosasync._demo.stock SRV_NAME …`` serves these names until its standard input ends.
+``python -m rosasync._demo.stock [--bare] SRV_NAME …`` serves these names until its standard input
+ends, in an executor's callbacks or in a bare loop.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import rclpy
 from diagnostic_msgs.srv import AddDiagnostics
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.signals import SignalHandlerOptions
 
 __all__ = ["READY", "ThreadedClient", "answer_of", "request_for", "serve"]
@@ -36,26 +38,57 @@ def answer_of(response: Any) -> str:
     return str(response.message)
 
 
-def serve(*srv_names: str) -> None:
-    """Serve an echo under each name with a SingleThreadedExecutor, until standard input ends.
+def serve(*srv_names: str, bare: bool = False) -> None:
+    """Serve an echo under each name until standard input ends.
 
     Blocks the calling thread, and needs the process for itself. The pipe is closed when the parent
     ends, also if it is killed, so the server never outlives its parent.
+
+    Args:
+        srv_names: the services.
+        bare: take and answer the requests in a loop around one wait set, which is about the least
+            that a server can do. Otherwise a SingleThreadedExecutor calls a callback for each.
     """
     context = Context()
     rclpy.init(context=context)
     node = rclpy.create_node("rosasync_stock_server", context=context)
-    for srv_name in srv_names:
-        node.create_service(Echo, srv_name, _echo)
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(node)
+    services = [node.create_service(Echo, srv_name, _echo) for srv_name in srv_names]
     threading.Thread(target=_shut_down_at_end_of_input, args=(context,), daemon=True).start()
     os.write(sys.stdout.fileno(), READY)
     with suppress(KeyboardInterrupt, ExternalShutdownException):
-        executor.spin()
-    executor.shutdown()
+        if bare:
+            _answer_in_a_loop(context, [service.handle for service in services])
+        else:
+            _spin(node)
     node.destroy_node()
     rclpy.try_shutdown(context=context)
+
+
+def _spin(node: Any) -> None:
+    executor = SingleThreadedExecutor(context=node.context)
+    executor.add_node(node)
+    try:
+        executor.spin()
+    finally:
+        executor.shutdown()
+
+
+def _answer_in_a_loop(context: Context, services: list[Any]) -> None:
+    guard = _rclpy.GuardCondition(context.handle)
+    context.on_shutdown(guard.trigger_guard_condition)
+    wait_set = _rclpy.WaitSet(0, 1, 0, 0, len(services), 0, context.handle)
+    while context.ok():
+        wait_set.clear_entities()
+        wait_set.add_guard_condition(guard)
+        for service in services:
+            wait_set.add_service(service)
+        wait_set.wait(-1)
+        for service in services:
+            while (taken := service.service_take_request(Echo.Request))[0] is not None:
+                request, header = taken
+                service.service_send_response(_echo(request, Echo.Response()), header.request_id)
+    wait_set.destroy_when_not_in_use()
+    guard.destroy_when_not_in_use()
 
 
 def _echo(request: Any, response: Any) -> Any:
@@ -80,7 +113,9 @@ class ThreadedClient:
     def __init__(self, srv_name: str) -> None:
         self._context = Context()
         rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
-        self._node = rclpy.create_node("rosasync_stock_client", context=self._context)
+        # Two nodes of one name would share the topic of their logs, which rclpy warns about.
+        name = "rosasync_stock_client" + srv_name.replace("/", "_")
+        self._node = rclpy.create_node(name, context=self._context)
         self._client = self._node.create_client(Echo, srv_name)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
@@ -115,4 +150,5 @@ class ThreadedClient:
 
 
 if __name__ == "__main__":
-    serve(*sys.argv[1:])
+    names = [argument for argument in sys.argv[1:] if argument != "--bare"]
+    serve(*names, bare="--bare" in sys.argv)
