@@ -30,7 +30,7 @@ import enum
 import numbers
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias, overload
@@ -39,6 +39,8 @@ import anyio
 
 from rosasync import RosasyncError, to_dict
 from rosasync._core.node_client import NodeClient
+from rosasync._core.parameter_files import read_file, write_file
+from rosasync._core.safe_yaml import YamlError, read_bytes
 
 if TYPE_CHECKING:
     from rosasync import Session
@@ -58,6 +60,9 @@ Names: TypeAlias = list[str]
 Several: TypeAlias = list[str] | tuple[str, ...] | Set[str]
 
 NOT_DECLARED = "it is not declared, or has no value"
+UNKNOWN = "it may have set them, or not"
+NO_BYTES = "a parameter file has no byte arrays"
+NO_EMPTY = "a parameter file has no empty arrays"
 
 
 class ParameterType(enum.IntEnum):
@@ -133,7 +138,9 @@ class ParameterDescriptor:
 
 
 class ParameterError(RosasyncError):
-    """A node refused to set parameters, or does not have them. It can be copied and pickled.
+    """A node refused to set parameters, or does not have them, or its answer makes no sense.
+
+    It can be copied and pickled.
 
     Attributes:
         node_name: the node's full name.
@@ -209,7 +216,7 @@ class ParameterClient(NodeClient):
             ParameterError: a parameter is not declared, or has no value.
         """
         values = await self._ask_all("GetParameters", "values", names, timeout)
-        return _one_or_all(names, {name: _from_ros(value) for name, value in values.items()})
+        return _one_or_all(names, self._values(values))
 
     @overload
     async def describe(self, names: str, /, *, timeout: Timeout = ...) -> ParameterDescriptor: ...
@@ -230,7 +237,10 @@ class ParameterClient(NodeClient):
             ParameterError: a parameter is not declared.
         """
         found = await self._ask_all("DescribeParameters", "descriptors", names, timeout)
-        return _one_or_all(names, {name: _descriptor(one) for name, one in found.items()})
+        return _one_or_all(
+            names,
+            {name: _descriptor(one, self._kind(name, one.type)) for name, one in found.items()},
+        )
 
     @overload
     async def types(self, names: str, /, *, timeout: Timeout = ...) -> ParameterType: ...
@@ -285,13 +295,17 @@ class ParameterClient(NodeClient):
             timeout: seconds for each call, None for no deadline; if left out, the client's.
 
         Raises:
-            ParameterError: the node refused one or more of them; it has the reason of each.
+            ParameterError: the node refused one or more of them; it has the reason of each. Or its
+                answer does not say which were set; the message says so.
             TypeError: a value is of a type that no parameter has; nothing was set.
             ValueError: a value is out of range; nothing was set.
         """
         values = _assignments(name, value)
         request = await self._request(values, timeout)
         results = (await self._call("SetParameters", request, timeout)).results
+        if len(results) != len(values):
+            text = f"the node answered with {len(results)} results for {len(values)}; {UNKNOWN}"
+            raise self._error(dict.fromkeys(values, text))
         self._check({n: r for n, r in zip(values, results, strict=True) if not r.successful})
 
     async def set_atomically(
@@ -323,13 +337,15 @@ class ParameterClient(NodeClient):
     ) -> dict[str, Any]:
         """Set the parameters that a YAML file has for this node, as ``ros2 param load`` does.
 
-        Each is set on its own: if one is refused, the others are set. One that is refused and has
-        the file's value already, such as a read-only parameter, is no error.
+        The file is read by the rules of rcl: each value is the one that a node has if it is started
+        with ``--params-file``. Each is set on its own: if one is refused, the others are set. One
+        that is refused and has the file's value already, such as a read-only parameter, is no
+        error.
 
         Args:
             file: the file's path.
             use_wildcard: whether to use the entries whose node name has wildcards, such as
-                ``/**``. The entry of the node itself comes first.
+                ``/**``. Of two entries for a parameter, the later one in the file counts.
             timeout: seconds for each call, None for no deadline; if left out, the client's.
 
         Returns:
@@ -338,16 +354,19 @@ class ParameterClient(NodeClient):
         Raises:
             ImportError: PyYAML is not installed; the message says how to install it.
             OSError: the file cannot be read.
-            ValueError: it is not a parameter file, or has no parameters for this node.
-            ParameterError, TypeError: as for `set`.
+            ValueError: it is not a parameter file, is larger than 64 MiB, or has no parameters for
+                this node.
+            ParameterError: as for `set`.
         """
-        text = await anyio.Path(file).read_text(encoding="utf-8")
-        values = _parse(os.fspath(file), text, self._node_name, use_wildcard)
+        # A large file takes seconds.
+        values = await anyio.to_thread.run_sync(
+            _read, os.fspath(file), self._node_name, use_wildcard, abandon_on_cancel=True
+        )
         try:
             await self.set(values, timeout=timeout)
         except ParameterError as error:
             current = await self._ask("GetParameters", "values", [*error.reasons], timeout)
-            same = {name for name in current if _from_ros(current[name]) == values[name]}
+            same = {name for name in current if _is_value(current[name], values[name])}
             reasons = {name: error.reasons[name] for name in error.reasons if name not in same}
             if reasons:
                 raise self._error(reasons) from None
@@ -356,21 +375,25 @@ class ParameterClient(NodeClient):
     async def dump(self, *, timeout: Timeout = ...) -> str:
         """Return the node's parameters as YAML, as ``ros2 param dump`` prints them.
 
-        Parameters without a value are left out.
+        A node that is started with the file has the same values, of the same types. Parameters
+        without a value are left out. So are byte arrays and empty arrays, which rcl cannot read: a
+        comment on top of the file names them.
 
         Args:
             timeout: seconds for each call, None for no deadline; if left out, the client's.
 
         Raises:
-            ImportError: PyYAML is not installed; the message says how to install it.
+            ParameterError: a parameter is of an unknown type.
         """
-        yaml = _import_yaml()
         names = await self.list(timeout=timeout)
-        found = await self._ask("GetParameters", "values", names, timeout)
-        tree = _nested((name, _to_yaml(_from_ros(value))) for name, value in found.items())
-        document = {self._node_name: {"ros__parameters": tree}}
-        text: str = yaml.safe_dump(document, default_flow_style=False)
-        return text
+        found = self._values(await self._ask("GetParameters", "values", names, timeout))
+        values = {name: value for name, value in found.items() if value is not None}
+        left_out = {name: NO_EMPTY for name, value in values.items() if value == []}
+        for name, value in values.items():
+            if isinstance(value, bytes):
+                left_out[name] = f"{NO_BYTES}; it is {[*value]}"
+        kept = {name: value for name, value in values.items() if name not in left_out}
+        return write_file(self._node_name, kept, left_out)
 
     async def _call(self, service: str, request: Mapping[str, Any], timeout: Timeout) -> Any:
         name = re.sub("(?<=[a-z])([A-Z])", r"_\1", service).lower()
@@ -397,8 +420,12 @@ class ParameterClient(NodeClient):
         # asked for the type of one.
         declared = {*await self.list(*names, timeout=timeout)}
         known = [name for name in names if name in declared]
-        found = await self._ask("GetParameterTypes", "types", known, timeout)
-        return {name: ParameterType(number) for name, number in found.items()}
+        types = await self._ask("GetParameterTypes", "types", known, timeout)
+        found = {name: self._kind(name, number) for name, number in types.items()}
+        # One that is declared with a type, and has no value yet.
+        unset = [name for name, kind in found.items() if kind is ParameterType.NOT_SET]
+        described = await self._ask("DescribeParameters", "descriptors", unset, timeout)
+        return found | {name: self._kind(name, one.type) for name, one in described.items()}
 
     async def _ask(
         self, service: str, field: str, names: Sequence[str], timeout: Timeout
@@ -409,6 +436,9 @@ class ParameterClient(NodeClient):
         answers = getattr(await self._call(service, {"names": names}, timeout), field)
         if len(answers) == len(names):
             return dict(zip(names, answers, strict=True))
+        if len(answers) > len(names):
+            text = f"the node answered with {len(answers)} {field} for {len(names)}"
+            raise self._error(dict.fromkeys(names, text))
         # A node does not say which of the names it does not know.
         if len(names) == 1:
             return {}
@@ -437,6 +467,19 @@ class ParameterClient(NodeClient):
             f"{name!r}: the type of an empty list is unknown, because {self._node_name} has no "
             "array of this name: give a list that is not empty, or b'' for a byte array"
         )
+
+    def _values(self, found: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the values of ``rcl_interfaces/msg/ParameterValue`` messages."""
+        return {
+            name: _value(message, self._kind(name, message.type)) for name, message in found.items()
+        }
+
+    def _kind(self, name: str, number: int) -> ParameterType:
+        try:
+            return ParameterType(number)
+        except ValueError:
+            reason = f"the node gives it the type {number}, which is not known"
+            raise self._error({name: reason}) from None
 
     def _check(self, refused: Mapping[str, Any]) -> None:
         if refused:
@@ -520,16 +563,21 @@ def _to_ros(kind: ParameterType | None, value: Any) -> dict[str, Any]:
     return {"type": kind} if kind is ParameterType.NOT_SET else {"type": kind, kind.field: value}
 
 
-def _from_ros(value: Any) -> Any:
-    kind = ParameterType(value.type)
-    return None if kind is ParameterType.NOT_SET else to_dict(value)[kind.field]
+def _value(message: Any, kind: ParameterType) -> Any:
+    return None if kind is ParameterType.NOT_SET else to_dict(message)[kind.field]
 
 
-def _descriptor(message: Any) -> ParameterDescriptor:
+def _is_value(message: Any, value: Any) -> bool:
+    """Return whether a node's value is this one; NaN is NaN, and 1 is neither 1.0 nor True."""
+    kind, value = _typed("", value)
+    return kind is not None and message.type == kind and repr(_value(message, kind)) == repr(value)
+
+
+def _descriptor(message: Any, kind: ParameterType) -> ParameterDescriptor:
     ranges = [*message.floating_point_range, *message.integer_range]
     return ParameterDescriptor(
         name=message.name,
-        type=ParameterType(message.type),
+        type=kind,
         description=message.description,
         constraints=message.additional_constraints,
         read_only=message.read_only,
@@ -541,82 +589,27 @@ def _descriptor(message: Any) -> ParameterDescriptor:
 # Files
 
 
-def _import_yaml() -> Any:
-    try:
-        import yaml
-    except ImportError as error:
-        raise ImportError(
-            f"parameter files need PyYAML, which cannot be imported here ({error}): "
-            "pip install 'rosasync[cli]'"
-        ) from error
-    return yaml
-
-
-def _to_yaml(value: Any) -> Any:
-    """Write a byte array as ``ros2 param dump`` does: as a list of single bytes."""
-    return [bytes((byte,)) for byte in value] if isinstance(value, bytes) else value
-
-
-def _nested(values: Iterable[tuple[str, Any]]) -> dict[str, Any]:
-    """Return nested dicts for sorted names with dots."""
-    root: dict[str, Any] = {}
-    for name, value in values:
-        if value is not None:
-            _insert(root, name, value)
-    return root
-
-
-def _insert(tree: dict[str, Any], name: str, value: Any) -> None:
-    first, dot, rest = name.partition(".")
-    inner = tree.setdefault(first, {}) if dot else None
-    if isinstance(inner, dict):
-        _insert(inner, rest, value)
-    else:
-        # It has no dot, or its first part is itself a parameter.
-        tree[name] = value
-
-
-def _flat(prefix: str, tree: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    for key, value in tree.items():
-        if isinstance(value, Mapping):
-            yield from _flat(f"{prefix}{key}.", value)
-        else:
-            yield f"{prefix}{key}", value
-
-
-def _parse(file: str, text: str, node_name: str, use_wildcard: bool) -> dict[str, Any]:
+def _read(file: str, node_name: str, use_wildcard: bool) -> dict[str, Any]:
     """Return the parameters that a file has for a node."""
-    yaml = _import_yaml()
     try:
-        document = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ValueError(f"{file} is not YAML: {error}") from error
-    entries = [*_entries("", document)] if isinstance(document, Mapping) else []
+        entries = read_file(read_bytes(file))
+    except YamlError as error:
+        raise ValueError(f"{file}: {error}") from None
     if not entries:
         raise ValueError(f"{file} is not a parameter file: no node in it has ros__parameters")
-    patterns = [tree for name, tree in entries if "*" in name and _matches(name, node_name)]
-    own = [tree for name, tree in entries if name == node_name]
-    chosen = [*patterns, *own] if use_wildcard else own
+    fitting = [(name, values) for name, values in entries if _matches(name, node_name)]
+    chosen = [values for name, values in fitting if use_wildcard or name == node_name]
     if not chosen:
         names = ", ".join(dict.fromkeys(name for name, _ in entries))
-        hint = "; use_wildcard uses the wildcards" if patterns else ""
+        hint = "; use_wildcard uses the wildcards" if fitting else ""
         raise ValueError(f"{file} has no parameters for {node_name}, only for {names}{hint}")
-    values = {name: _typed(name, value)[1] for tree in chosen for name, value in _flat("", tree)}
-    empty = [name for name, value in values.items() if value is None]
+    merged = {name: value for values in chosen for name, value in values.items()}
+    empty = [name for name, value in merged.items() if value is None]
     if empty:
-        raise ValueError(f"{file} has no value for {', '.join(empty)}")
-    return values
-
-
-def _entries(namespace: str, tree: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """Yield each node's name, or pattern, with its parameters."""
-    for key, inner in tree.items():
-        if not isinstance(inner, Mapping):
-            continue
-        if key == "ros__parameters":
-            yield namespace or "/", inner
-        else:
-            yield from _entries(f"{namespace}/{str(key).strip('/')}", inner)
+        raise ValueError(
+            f"{file} has no value for {', '.join(empty)}: rcl reads no empty lists and mappings"
+        )
+    return merged
 
 
 def _matches(pattern: str, node_name: str) -> bool:

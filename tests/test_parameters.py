@@ -10,15 +10,20 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import AsyncExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy
 import pytest
 import yaml
+from rcl_interfaces.msg import ParameterDescriptor as RosDescriptor
+from rcl_interfaces.msg import ParameterValue, SetParametersResult
 
 import rosasync
 from rosasync import Session
+from rosasync._core.safe_yaml import MAX_BYTES
 from rosasync.parameters import (
     ParameterClient,
     ParameterDescriptor,
@@ -184,6 +189,15 @@ class TestSetting:
         await arm.set("any", None)
         assert "any" not in await arm.list()
 
+    async def test_one_that_is_declared_with_a_type_and_no_value(
+        self, session: Session, nodes: NodesProcess
+    ) -> None:
+        node = ParameterClient(session, await nodes.add("unset"))
+        assert await node.types("unset") is ParameterType.INTEGER
+        assert await node.types("texts") is ParameterType.STRING_ARRAY
+        await node.set("texts", [])
+        assert await node.get("texts") == []
+
     async def test_undeclared_ones_where_they_are_allowed(
         self, session: Session, nodes: NodesProcess
     ) -> None:
@@ -238,7 +252,11 @@ class TestFiles:
         for name in ALWAYS:
             tree.pop(name, None)
         assert tree == {
-            **{name: value for name, value in (VALUES | OTHERS).items() if "." not in name},
+            **{
+                name: value
+                for name, value in (VALUES | OTHERS).items()
+                if "." not in name and name != "byte_array"
+            },
             "arm": {"left": {"speed": 1.0}, "right": {"speed": 2.0}},
         }
         assert "  ros__parameters:\n    any: 1\n    arm:\n      left:\n        speed: 1.0\n" in text
@@ -247,7 +265,7 @@ class TestFiles:
         file = tmp_path / "arm.yaml"
         text = await arm.dump()
         file.write_text(text)
-        await arm.set({"double": 7.0, "byte_array": b"", "arm.left.speed": 9.0})
+        await arm.set({"double": 7.0, "arm.left.speed": 9.0})
         loaded = await arm.load(file)
         assert loaded["arm.left.speed"] == 1.0
         assert await arm.get([*PLAIN]) == PLAIN
@@ -288,12 +306,12 @@ stock:
         )
         assert await arm.load(file) == {"volume": 7}
         assert await arm.load(file, use_wildcard=True) == {
-            "volume": 7,
+            "volume": 8,
             "gain": 0.25,
             "mode": "on",
         }
         assert await arm.get(["volume", "gain", "mode", "string"]) == {
-            "volume": 7,
+            "volume": 8,
             "gain": 0.25,
             "mode": "on",
             "string": PLAIN["string"],
@@ -309,6 +327,9 @@ stock:
             ("/b: {ros__parameters: {a: 1}}", "no parameters for /stock/.*, only for /b$"),
             ("/**: {ros__parameters: {a: 1}}", r"only for /\*\*; use_wildcard"),
             ("NODE: {ros__parameters: {a: }}", "has no value for a"),
+            ("NODE: {ros__parameters: {a: [], b: 1}}", "has no value for a: rcl reads no empty"),
+            ("NODE: {ros__parameters: {a: [1, on]}}", "'on' is read as a bool"),
+            ("NODE: {ros__parameters: {a: &a 1, b: *a}}", "has no aliases"),
         ],
     )
     async def test_files_that_do_not_fit(
@@ -318,6 +339,33 @@ stock:
         file.write_text(text.replace("NODE", arm.node_name))
         with pytest.raises(ValueError, match=f"bad.yaml.*{message}"):
             await arm.load(file)
+
+    async def test_a_binary_file(self, arm: ParameterClient, tmp_path: Path) -> None:
+        file = tmp_path / "binary.yaml"
+        file.write_bytes(bytes(range(256)))
+        with pytest.raises(ValueError, match="binary.yaml: this is not YAML"):
+            await arm.load(file)
+
+    async def test_a_file_beyond_the_limits(self, arm: ParameterClient, tmp_path: Path) -> None:
+        file = tmp_path / "large.yaml"
+        with file.open("wb") as opened:
+            opened.truncate(MAX_BYTES + 1)
+        with pytest.raises(ValueError, match="large.yaml: this YAML is too large"):
+            await arm.load(file)
+        file.write_text("{a: " * 200)
+        with pytest.raises(ValueError, match="nested too deeply"):
+            await arm.load(file)
+
+    async def test_nan_is_the_value_that_it_has(
+        self, session: Session, nodes: NodesProcess, tmp_path: Path
+    ) -> None:
+        node = ParameterClient(session, await nodes.add("read_only"))
+        file = tmp_path / "nan.yaml"
+        file.write_text(await node.dump())
+        await node.load(file)
+        file.write_text(f"{node.node_name}: {{ros__parameters: {{whole: 1}}}}")
+        with pytest.raises(ParameterError, match="'whole'"):
+            await node.load(file)
 
     async def test_a_parameter_below_another(
         self, session: Session, nodes: NodesProcess, tmp_path: Path
@@ -335,7 +383,7 @@ import sys
 sys.modules["yaml"] = None
 import rosasync.parameters
 try:
-    rosasync.parameters._import_yaml()
+    rosasync.parameters._read("/dev/null", "/arm", False)
 except ImportError as error:
     print(error)
 """
@@ -365,8 +413,73 @@ async def test_names_and_timeouts(session: Session) -> None:
     assert repr(ParameterClient(session, "/a/b")) == "<ParameterClient /a/b>"
     with pytest.raises(rosasync.InvalidServiceName):
         ParameterClient(session, "/no spaces")
+    with pytest.raises(rosasync.InvalidServiceName, match="the name of a node is missing"):
+        ParameterClient(session, "")
+    with pytest.raises(TypeError, match="a node's name is a str, not a NoneType"):
+        ParameterClient(session, None)  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="timeout"):
         ParameterClient(session, "/arm", timeout="soon")  # type: ignore[arg-type]
+
+
+@dataclass
+class Hostile:
+    """A node whose answers about parameters make no sense."""
+
+    name = "/hostile"
+    results: int = 0
+    kind: int = 99
+
+    def serve(self, session: Session, service: str, srv_type: str) -> rosasync.ServiceServer:
+        handler = getattr(self, service)
+        return session.serve(f"rcl_interfaces/srv/{srv_type}", f"{self.name}/{service}", handler)
+
+    def set_parameters(self, _: Any, response: Any) -> Any:
+        response.results = [SetParametersResult(successful=True)] * self.results
+        return response
+
+    def get_parameters(self, request: Any, response: Any) -> Any:
+        response.values = [ParameterValue(type=self.kind) for _ in request.names]
+        return response
+
+    def get_parameter_types(self, request: Any, response: Any) -> Any:
+        response.types = [self.kind] * len(request.names)
+        return response
+
+    def describe_parameters(self, request: Any, response: Any) -> Any:
+        response.descriptors = [RosDescriptor(type=self.kind) for _ in request.names] * 2
+        return response
+
+    def list_parameters(self, _: Any, response: Any) -> Any:
+        response.result.names = ["a"]
+        return response
+
+
+async def test_a_hostile_node(session: Session) -> None:
+    hostile = Hostile()
+    services = {
+        "set_parameters": "SetParameters",
+        "get_parameters": "GetParameters",
+        "get_parameter_types": "GetParameterTypes",
+        "describe_parameters": "DescribeParameters",
+        "list_parameters": "ListParameters",
+    }
+    async with AsyncExitStack() as stack:
+        for service, srv_type in services.items():
+            await stack.enter_async_context(hostile.serve(session, service, srv_type))
+        node = ParameterClient(session, hostile.name)
+        with pytest.raises(ParameterError, match="0 results for 2; it may have set them, or not"):
+            await node.set({"a": 1, "b": 2})
+        hostile.results = 3
+        with pytest.raises(ParameterError, match="3 results for 2") as caught:
+            await node.set({"a": 1, "b": 2})
+        assert [*caught.value.reasons] == ["a", "b"]
+        for ask in (node.get, node.types):
+            with pytest.raises(ParameterError, match="'a': .* the type 99, which is not known"):
+                await ask("a")
+        with pytest.raises(ParameterError, match="'a': .* the type 99, which is not known"):
+            await node.dump()
+        with pytest.raises(ParameterError, match="answered with 2 descriptors for 1"):
+            await node.describe("a")
 
 
 def test_the_error_is_copied_and_pickled() -> None:

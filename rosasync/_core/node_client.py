@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from rosasync.errors import InvalidServiceName
+
 if TYPE_CHECKING:
     from rosasync.session import Session
     from rosasync.typing import Timeout
@@ -24,12 +26,18 @@ class NodeClient:
         service: the last part of that service's name.
 
     Raises:
+        TypeError: the node's name is not a str.
+        InvalidServiceName: it is empty.
         Exception: as `Session.client`.
     """
 
     def __init__(
         self, session: Session, node_name: str, timeout: Timeout, srv_type: str, service: str
     ) -> None:
+        if not isinstance(node_name, str):
+            raise TypeError(f"a node's name is a str, not a {type(node_name).__name__}")
+        if not node_name:
+            raise InvalidServiceName("the name of a node is missing: expected one such as '/arm'")
         client = session.client(srv_type, f"{node_name}/{service}", timeout=timeout)
         self._session = session
         self._timeout = timeout

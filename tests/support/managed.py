@@ -7,6 +7,7 @@ blocks holds up its own node only.
 from __future__ import annotations
 
 import itertools
+import math
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -119,7 +120,16 @@ class _Nodes:
         node = _node(name)
         node.declare_parameter("first", 1)
         node.declare_parameter("unset", Parameter.Type.INTEGER)
+        node.declare_parameter("texts", Parameter.Type.STRING_ARRAY)
         node.declare_parameter("last", "z")
+        return node
+
+    def _read_only(self, name: str) -> Any:
+        from rcl_interfaces.msg import ParameterDescriptor
+
+        node = _node(name)
+        for parameter, value in (("nan", math.nan), ("nans", [math.nan, 1.0]), ("whole", 1.0)):
+            node.declare_parameter(parameter, value, ParameterDescriptor(read_only=True))
         return node
 
     def _undeclared(self, name: str) -> Any:
