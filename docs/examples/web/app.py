@@ -1,19 +1,21 @@
-"""A web application that switches a lamp: each HTTP request is a service call.
+"""A web application for a lamp and a camera: each HTTP request is a service call.
 
 Run it with ``uvicorn --factory app:create_app``.
 """
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from typing import Annotated
+from typing import Annotated, Any
 
-from fastapi import APIRouter, Depends, FastAPI, Request
+from fastapi import APIRouter, Body, Depends, FastAPI, HTTPException, Request
 from fastapi.responses import JSONResponse
+from sensor_msgs.srv import SetCameraInfo
 from std_srvs.srv import SetBool
 
 import rosasync
 
 LAMP = "/lamp/switch"
+CAMERA = "/camera/set_camera_info"
 STATUS = {
     rosasync.ServiceUnavailable: 503,
     rosasync.PoolFull: 503,
@@ -22,6 +24,8 @@ STATUS = {
     rosasync.ResponseTimeout: 504,
 }
 """The HTTP status of each error; 502 for others."""
+RETRY_AFTER = "1"
+"""Seconds after which a client may try again, if the status is 503."""
 
 router = APIRouter()
 
@@ -31,6 +35,20 @@ async def session_of(request: Request) -> rosasync.Session:
     return session
 
 
+def message_of(message_type: type[Any], body: dict[str, Any]) -> Any:
+    """Return the message in a body of JSON; a status of 422 says which field does not fit."""
+    try:
+        return rosasync.to_message(message_type, body)
+    except (TypeError, ValueError) as error:
+        raise HTTPException(422, str(error)) from error
+
+
+def body_of(message_type: type[Any]) -> dict[str, Any]:
+    """Return what OpenAPI needs to describe a body that is a message."""
+    schema = rosasync.json_schema(message_type)
+    return {"requestBody": {"content": {"application/json": {"schema": schema}}}}
+
+
 Session = Annotated[rosasync.Session, Depends(session_of)]
 
 
@@ -38,6 +56,12 @@ Session = Annotated[rosasync.Session, Depends(session_of)]
 async def switch(on: bool, session: Session) -> dict[str, str]:
     response = await session.call(SetBool, LAMP, {"data": on})
     return {"lamp": response.message}
+
+
+@router.put("/camera", openapi_extra=body_of(SetCameraInfo.Request))
+async def calibrate(body: Annotated[dict[str, Any], Body()], session: Session) -> dict[str, Any]:
+    response = await session.call(SetCameraInfo, CAMERA, message_of(SetCameraInfo.Request, body))
+    return rosasync.to_dict(response, json=True)
 
 
 @router.get("/health")
@@ -50,7 +74,9 @@ async def health(session: Session) -> dict[str, object]:
 
 
 async def explain(request: Request, error: Exception) -> JSONResponse:
-    return JSONResponse({"detail": str(error)}, STATUS.get(type(error), 502))
+    status = STATUS.get(type(error), 502)
+    headers = {"Retry-After": RETRY_AFTER} if status == 503 else None
+    return JSONResponse({"detail": str(error)}, status, headers)
 
 
 def create_app(session: rosasync.Session | None = None) -> FastAPI:
