@@ -60,6 +60,48 @@ HANDLES = {
 OBTAINED = ("ClientPool", "LeasedClient", "Portal", "ServiceCall", "ServiceClient", "ServiceServer")
 """Classes that only a session constructs, so their arguments are not shown."""
 
+SUBJECTS = {
+    "how-to/callbacks": ["callback", "deadlock", "subscription", "timer"],
+    "how-to/deploy": ["docker", "graceful shutdown", "launch file", "sigterm", "systemd"],
+    "how-to/domains": ["domain", "namespace", "ROS_DOMAIN_ID"],
+    "how-to/errors": ["cancel", "deadline", "error handling", "exceptions", "timeout", "warm up"],
+    "how-to/fastapi": ["fastapi", "http", "json", "rest api", "web"],
+    "how-to/from-rclpy": ["call_async", "migrate", "porting", "rclpy"],
+    "how-to/install": ["aarch64", "arm", "conda", "install", "pip", "robostack", "rosdep"],
+    "how-to/lifecycle": ["lifecycle", "managed nodes", "transition"],
+    "how-to/logging": ["debug", "log", "logging", "metrics", "opentelemetry", "tracing"],
+    "how-to/loops": ["anyio", "event loop", "uvloop"],
+    "how-to/middleware": ["cyclonedds", "middleware", "zenoh"],
+    "how-to/network": ["discovery", "packet loss", "wifi"],
+    "how-to/node": ["await a future", "borrow a node", "existing node", "wrap_future"],
+    "how-to/notebook": ["ipython", "jupyter", "notebook"],
+    "how-to/own-types": ["colcon", "custom srv", "own types"],
+    "how-to/parameters": ["param", "parameters", "yaml"],
+    "how-to/pool": ["client pool", "concurrency limit", "limits", "pool"],
+    "how-to/qt": ["gui", "pyqt", "pyside", "qt"],
+    "how-to/retry": ["at least once", "resend", "retry"],
+    "how-to/servers": ["deferred response", "server", "service server"],
+    "how-to/testing": ["fixture", "mock", "pytest", "simulate", "test", "unit test"],
+    "how-to/ticks": ["behavior tree", "behavior trees", "behaviour tree", "py_trees", "thread"],
+    "how-to/typing": ["mypy", "pyright", "type hints"],
+}
+"""What people type into the search box, and the page that is about it. The search finds an entry of
+the index before everything else."""
+
+
+class SubjectsInIndex(SphinxTransform):
+    """Enter the subjects of a page into the index."""
+
+    default_priority = 500
+
+    def apply(self, **kwargs: Any) -> None:
+        """Put an index node with the page's subjects before its text."""
+        entries = [
+            ("single", subject, "", "main", None) for subject in SUBJECTS.get(self.env.docname, ())
+        ]
+        if entries:
+            self.document.insert(0, addnodes.index(entries=entries))
+
 
 class NamesToReferences(SphinxTransform):
     """Link the names in the pages' code spans, such as `session.call`, to the reference."""
@@ -114,7 +156,8 @@ def _skip_private(
 
 
 def setup(app: Sphinx) -> None:
-    """Register the transform and the two filters of the reference."""
+    """Register the transforms and the two filters of the reference."""
+    app.add_transform(SubjectsInIndex)
     app.add_transform(NamesToReferences)
     app.connect("autodoc-process-signature", _hide_arguments)
     app.connect("autodoc-skip-member", _skip_private)

@@ -87,6 +87,32 @@ PAINS = {
 """The section of the page *Troubleshooting* for each of the fifteen known pains, by the beginning
 of its title, and what users type into a search box: words of the questions and issues about it."""
 
+FIRST = {
+    "behavior trees": "how-to/ticks",
+    "cancel": "how-to/errors",
+    "conda": "how-to/install",
+    "deadline": "how-to/errors",
+    "deadlock": "how-to/callbacks",
+    "docker": "how-to/deploy",
+    "graceful shutdown": "how-to/deploy",
+    "jupyter": "how-to/notebook",
+    "launch file": "how-to/deploy",
+    "lifecycle": "how-to/lifecycle",
+    "mock": "how-to/testing",
+    "mypy": "how-to/typing",
+    "opentelemetry": "how-to/logging",
+    "packet loss": "how-to/network",
+    "parameters": "how-to/parameters",
+    "pool": "how-to/pool",
+    "pytest": "how-to/testing",
+    "retry": "how-to/retry",
+    "server": "how-to/servers",
+    "timeout": "how-to/errors",
+    "uvloop": "how-to/loops",
+    "zenoh": "how-to/middleware",
+}
+"""What is searched for, and the page that has to come first."""
+
 FEW = 16
 """A search that finds more pages than these does not help."""
 
@@ -105,6 +131,23 @@ class Search:
         """Return the names of the pages."""
         found = map(self._with, self.stems(query))
         return {self._index["docnames"][number] for number in set.intersection(*found)}
+
+    def first(self, query: str) -> str | None:
+        """Return the page that comes first: that of a main entry of the index.
+
+        Such an entry scores 100 times the share of it that the query is, and all else 31 at most
+        (Sphinx's searchtools.js). None if no page stands out like that.
+        """
+        scores: dict[int, float] = {}
+        for entry, found in self._index["indexentries"].items():
+            if query in entry and len(query) >= len(entry) / 2:
+                score = round(100 * len(query) / len(entry))
+                for number, _, main in found:
+                    if main:
+                        scores[number] = max(score, scores.get(number, 0))
+        best = max(scores.values(), default=0)
+        pages = [self._index["docnames"][n] for n, score in scores.items() if score == best > 31]
+        return pages[0] if len(pages) == 1 else None
 
     def stems(self, text: str) -> set[str]:
         """Return what counts of the words of a text."""
@@ -173,6 +216,8 @@ def test_the_site(tmp_path: Path) -> None:
     for title, queries in PAINS.items():
         section = search.stems(section_of("troubleshooting", title))
         assert not {q: search.stems(q) - section for q in queries if search.stems(q) - section}
+
+    assert {query: search.first(query) for query in FIRST} == FIRST
 
     tutorial = (tmp_path / "tutorial.html").read_text()
     assert 'href="reference/session.html#rosasync.Session.call"' in tutorial
