@@ -32,6 +32,48 @@ async def test_lenient(ros_graph):
 """
 
 
+LOOP_SCOPES = """
+import asyncio
+import pytest
+from std_srvs.srv import SetBool
+
+loops = set()
+
+async def enable(graph):
+    loops.add(asyncio.get_running_loop())
+    graph.stub(SetBool, "/arm", {"success": True})
+    async with graph.session() as session:
+        assert (await session.call(SetBool, "/arm")).success
+
+@pytest.mark.asyncio(loop_scope=SCOPE)
+class TestLoops:
+    async def test_one(self, ros_graph):
+        await enable(ros_graph)
+
+    @pytest.mark.parametrize("ros_graph", ["memory", "real"], indirect=True)
+    async def test_two(self, ros_graph):
+        await enable(ros_graph)
+
+    async def test_one_loop(self):
+        assert len(loops) == LOOPS
+
+async def test_the_default(ros_graph):
+    await enable(ros_graph)
+"""
+
+PLAIN = """
+import pytest
+from std_srvs.srv import SetBool
+
+@pytest.fixture
+def arm(ros_graph):
+    return ros_graph.stub(SetBool, "/arm", {})
+
+async def test_arm(arm):
+    pass
+"""
+
+
 @pytest.fixture
 def project(tmp_path: Path) -> Path:
     (tmp_path / "pytest.ini").write_text("[pytest]\nasyncio_mode = auto\naddopts = -ra\n")
@@ -54,7 +96,10 @@ def test_the_examples_of_the_page(project: Path, kind: str) -> None:
     page = (ROOT / "docs" / "how-to" / "testing.md").read_text()
     blocks = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     (project / "test_page.py").write_text("\n".join(blocks))
-    assert re.search(r"= 6 passed", output := run(project, f"--rosasync-graph={kind}")), output
+    (configuration,) = re.findall(r"^```ini\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    (project / "pytest.ini").write_text(configuration)
+    output = run(project, f"--rosasync-graph={kind}", "-W", "error::pytest.PytestWarning")
+    assert "6 passed" in output, output
 
 
 def test_strictness(project: Path) -> None:
@@ -63,6 +108,39 @@ def test_strictness(project: Path) -> None:
     assert "3 passed, 2 errors" in output
     assert "/arm was never called" in output
     assert "/arm (std_srvs/srv/SetBool) was called, and has no server" in output
+
+
+@pytest.mark.parametrize("scope", ["function", "class", "session"])
+def test_the_graph_is_in_the_loop_of_the_test(project: Path, scope: str) -> None:
+    loops = 3 if scope == "function" else 1
+    code = LOOP_SCOPES.replace("SCOPE", repr(scope)).replace("== LOOPS", f"== {loops}")
+    (project / "test_loops.py").write_text(code)
+    assert "5 passed" in (output := run(project)), output
+
+
+def test_the_graph_is_in_the_loop_that_the_configuration_says(project: Path) -> None:
+    code = LOOP_SCOPES.replace("@pytest.mark.asyncio(loop_scope=SCOPE)", "").replace("LOOPS", "1")
+    (project / "test_loops.py").write_text(code)
+    output = run(project, "-o", "asyncio_default_test_loop_scope=module")
+    assert "5 passed" in output, output
+
+
+def test_a_plain_fixture_is_told_to_be_async(project: Path) -> None:
+    (project / "test_plain.py").write_text(PLAIN)
+    output = run(project)
+    assert "UsageError: /arm cannot be served by arm" in output, output
+    assert "make it async (async def arm)" in output
+
+
+def test_a_session_of_another_loop_is_told_apart_by_its_scope(project: Path) -> None:
+    (project / "test_other.py").write_text(
+        "import pytest\nfrom rosasync.testing import FakeGraph\n"
+        "@pytest.fixture\nasync def session():\n"
+        "    async with FakeGraph().session() as session:\n        yield session\n"
+        "@pytest.mark.asyncio(loop_scope='session')\nasync def test_it(session):\n"
+        "    await session.call('std_srvs/srv/Empty', '/x')\n"
+    )
+    assert "loop_scope of the test" in (output := run(project)), output
 
 
 def test_a_project_that_does_not_use_it_imports_no_rclpy(project: Path) -> None:

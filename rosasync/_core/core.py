@@ -6,6 +6,7 @@ import _thread
 import asyncio
 import atexit
 import logging
+import sys
 import threading
 import warnings
 import weakref
@@ -85,6 +86,11 @@ class Core:
             return f"{name} belongs to the loop of another thread: use session.from_thread here"
         if asyncio._get_running_loop() is None:
             return f"{name} is used without a running event loop: use it in a coroutine of its loop"
+        if "pytest_asyncio" in sys.modules:
+            return (
+                f"{name} belongs to another event loop: give the fixture that opens it the "
+                "loop_scope of the test, as in @pytest_asyncio.fixture(loop_scope=…)"
+            )
         return (
             f"{name} belongs to another event loop, and asyncio.run makes a new one each time: "
             "open a session in each loop, or run everything in one"

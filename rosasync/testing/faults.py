@@ -7,9 +7,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Generic
 
 from rosasync._core.ports import PortDestroyed, Undeliverable, Unmatched
+from rosasync.typing import RequestT, ResponseT
 
 if TYPE_CHECKING:
     from rosasync._core.ports import DeliverRequest, RequestHeader, Service, ServicePort
@@ -22,7 +23,7 @@ REMATCH = 0.05
 
 
 @dataclass(eq=False)
-class StubCall:
+class StubCall(Generic[RequestT, ResponseT]):
     """A request that a `StubServer` received.
 
     Attributes:
@@ -31,8 +32,8 @@ class StubCall:
             responds, even if a fault then delays or drops it.
     """
 
-    request: Any
-    response: Any = None
+    request: RequestT
+    response: ResponseT | None = None
 
 
 @dataclass
@@ -92,14 +93,14 @@ class FaultyService:
         service: Service,
         deliver: DeliverRequest,
         faults: Faults,
-        on_call: Callable[[StubCall], None],
+        on_call: Callable[[StubCall[Any, Any]], None],
     ) -> None:
         self._loop = asyncio.get_running_loop()
         self._deliver = deliver
         self._faults = faults
         self._on_call = on_call
         # By the identity of the header, which is kept so that no other one takes its place.
-        self._calls: dict[int, tuple[RequestHeader, StubCall]] = {}
+        self._calls: dict[int, tuple[RequestHeader, StubCall[Any, Any]]] = {}
         self._closed = False
         self._port = open_service(service, self._arrived)
 
@@ -163,7 +164,7 @@ class FaultyService:
         if self._faults.dropping_requests:
             self._faults.lost_requests += 1
             return
-        call = StubCall(deepcopy(request))
+        call = StubCall[Any, Any](deepcopy(request))
         self._calls[id(header)] = header, call
         self._on_call(call)
         self._deliver(request, header)

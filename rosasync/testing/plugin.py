@@ -7,7 +7,9 @@ the fixtures.
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import AsyncIterator
+import inspect
+from collections.abc import AsyncIterator, Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -21,13 +23,41 @@ REAL_SETTLE = 0.1
 """Seconds for which a virtual clock waits for responses on real ROS, before each step."""
 
 
-def _async_fixture(function: Any) -> Any:
-    """Make an async fixture, for pytest-asyncio in its strict mode too."""
+LOOP_SCOPES = ("function", "class", "module", "package", "session")
+"""How long a loop of pytest-asyncio may live."""
+
+KIND = pytest.StashKey[Any]()
+"""Where the parameter of ``ros_graph`` is kept for the fixture that opens the graph."""
+
+
+def _async_fixture(loop_scope: str) -> Callable[[Any], Any]:
+    """Return the decorator of an async fixture, for pytest-asyncio in its strict mode too."""
+    name = _in_loop(loop_scope)
     if importlib.util.find_spec("pytest_asyncio") is None:
-        return pytest.fixture(function)
+        return pytest.fixture(name=name)
     import pytest_asyncio
 
-    return pytest_asyncio.fixture(function)
+    make: Any = pytest_asyncio.fixture
+    if "loop_scope" in inspect.signature(make).parameters:
+        make = partial(make, loop_scope=loop_scope)
+    # Older ones, before 0.24, have one loop for each test.
+    return make(name=name)  # type: ignore[no-any-return]
+
+
+def _in_loop(loop_scope: str) -> str:
+    """Return the name of the fixture that opens the graph in a loop of this scope."""
+    return f"_ros_graph_in_{loop_scope}_loop"
+
+
+def _loop_scope(request: pytest.FixtureRequest) -> str:
+    """Return how long the loop of a test lives, as its mark or the configuration says."""
+    marker = request.node.get_closest_marker("asyncio")
+    if marker is not None and (scope := marker.kwargs.get("loop_scope")):
+        return str(scope)
+    try:
+        return str(request.config.getini("asyncio_default_test_loop_scope"))
+    except ValueError:
+        return "function"
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -66,16 +96,34 @@ def ros_domain() -> int:
     return isolate_once()
 
 
-@_async_fixture
-async def ros_graph(request: pytest.FixtureRequest) -> AsyncIterator[Graph]:
-    """An open, strict graph: in memory, or on real ROS as its parameter or the option says."""
-    from rosasync.testing import Graph
+@pytest.fixture
+def ros_graph(request: pytest.FixtureRequest) -> Graph:
+    """An open, strict graph: in memory, or on real ROS as its parameter or the option says.
 
-    marker = request.node.get_closest_marker("rosasync")
-    strict = True if marker is None else marker.kwargs.get("strict", True)
-    kind = getattr(request, "param", None) or request.config.getoption("--rosasync-graph")
-    async with Graph(kind, strict=strict) as graph:
-        yield graph
+    It is open in the loop of the test, whatever ``loop_scope`` that has.
+    """
+    request.node.stash[KIND] = getattr(request, "param", None)
+    graph: Graph = request.getfixturevalue(_in_loop(_loop_scope(request)))
+    return graph
+
+
+def _graph_fixture(loop_scope: str) -> Any:
+    @_async_fixture(loop_scope)
+    async def graph(request: pytest.FixtureRequest) -> AsyncIterator[Graph]:
+        from rosasync.testing import Graph
+
+        marker = request.node.get_closest_marker("rosasync")
+        strict = True if marker is None else marker.kwargs.get("strict", True)
+        kind = request.node.stash[KIND] or request.config.getoption("--rosasync-graph")
+        async with Graph(kind, strict=strict) as graph:
+            yield graph
+
+    return graph
+
+
+# One for each scope, because pytest-asyncio binds a fixture to a scope when it is declared.
+for _scope in LOOP_SCOPES:
+    globals()[_in_loop(_scope)] = _graph_fixture(_scope)
 
 
 @pytest.fixture

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import asyncio
+import inspect
 import json
 from collections.abc import Callable
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self, overload
 
 from rosasync.errors import UsageError
 from rosasync.testing.graph import FakeGraph
 from rosasync.testing.hooks import GraphSession, Hooks
 from rosasync.testing.stub import STUB, Answer, StubServer
+from rosasync.typing import RequestT, ResponseT, ServiceType
 
 if TYPE_CHECKING:
     from rosasync._core.ports import Service
+    from rosasync._server.handlers import Handler
     from rosasync._server.server import ServiceServer
     from rosasync.session import Session
     from rosasync.testing.recording import Recording
@@ -58,7 +62,7 @@ class Graph:
             raise ValueError(f"kind must be 'memory' or 'real', not {kind!r}")
         self.kind = kind
         self.strict = strict
-        self.servers: list[StubServer] = []
+        self.servers: list[StubServer[Any, Any]] = []
         self.unexpected: list[str] = []
         self._fake = FakeGraph() if kind == "memory" else None
         self._hooks = Hooks()
@@ -113,6 +117,28 @@ class Graph:
             hooks.wrap_client = recording.wrap_client
         return GraphSession(hooks, self._fake, node, **options)
 
+    @overload
+    def serve(
+        self,
+        srv_type: ServiceType[RequestT, ResponseT],
+        srv_name: str,
+        handler: Handler[RequestT, ResponseT] | None = None,
+        *,
+        optional: bool = False,
+        **options: Any,
+    ) -> StubServer[RequestT, ResponseT]: ...
+
+    @overload
+    def serve(
+        self,
+        srv_type: str,
+        srv_name: str,
+        handler: Handler[Any, Any] | None = None,
+        *,
+        optional: bool = False,
+        **options: Any,
+    ) -> StubServer[Any, Any]: ...
+
     def serve(
         self,
         srv_type: Any,
@@ -121,7 +147,7 @@ class Graph:
         *,
         optional: bool = False,
         **options: Any,
-    ) -> StubServer:
+    ) -> StubServer[Any, Any]:
         """Serve a service with a handler.
 
         Args:
@@ -134,24 +160,28 @@ class Graph:
 
         Raises:
             TypeError, ValueError, InvalidServiceName: as `rosasync.Session.serve`.
-            UsageError: the graph is not open.
+            UsageError: the graph is not open, or this runs outside its loop.
         """
-        self._open()
-        server = StubServer(
-            srv_type,
-            srv_name,
-            handler,
-            options,
-            optional,
-            self._open_server,
-            self.unexpected.append,
-        )
-        self.servers.append(server)
-        return server
+        return self._serve(srv_type, srv_name, handler, optional, options)
+
+    @overload
+    def stub(
+        self,
+        srv_type: ServiceType[RequestT, ResponseT],
+        srv_name: str,
+        *answers: Answer,
+        optional: bool = False,
+        **options: Any,
+    ) -> StubServer[RequestT, ResponseT]: ...
+
+    @overload
+    def stub(
+        self, srv_type: str, srv_name: str, *answers: Answer, optional: bool = False, **options: Any
+    ) -> StubServer[Any, Any]: ...
 
     def stub(
         self, srv_type: Any, srv_name: str, *answers: Answer, optional: bool = False, **options: Any
-    ) -> StubServer:
+    ) -> StubServer[Any, Any]:
         """Serve a service with fixed answers; further ones by `StubServer.answer`.
 
         Args:
@@ -163,12 +193,14 @@ class Graph:
 
         Raises:
             TypeError, ValueError, InvalidServiceName: an argument does not fit.
-            UsageError: the graph is not open.
+            UsageError: the graph is not open, or this runs outside its loop.
         """
-        server = self.serve(srv_type, srv_name, STUB, optional=optional, **options)
+        server = self._serve(srv_type, srv_name, STUB, optional, options)
         return server.answer(*answers) if answers else server
 
-    def replay(self, recording: Recording, *, optional: bool = False) -> dict[str, StubServer]:
+    def replay(
+        self, recording: Recording, *, optional: bool = False
+    ) -> dict[str, StubServer[Any, Any]]:
         """Serve each service of a recording with its responses.
 
         The same request gets its recorded responses in turn, and then the last one again. A
@@ -181,7 +213,7 @@ class Graph:
         Returns:
             The server of each service name.
         """
-        servers: dict[str, StubServer] = {}
+        servers: dict[str, StubServer[Any, Any]] = {}
         answers: dict[tuple[str, str], list[Answer]] = {}
         requests: dict[tuple[str, str], Any] = {}
         for call in recording.calls:
@@ -212,6 +244,23 @@ class Graph:
         if problems := [*dict.fromkeys(self.unexpected), *uncalled]:
             raise AssertionError("\n".join(["the graph is strict, and", *problems]))
 
+    def _serve(
+        self, srv_type: Any, srv_name: str, handler: Any, optional: bool, options: dict[str, Any]
+    ) -> StubServer[Any, Any]:
+        self._open()
+        _check_loop(srv_name)
+        server = StubServer[Any, Any](
+            srv_type,
+            srv_name,
+            handler,
+            options,
+            optional,
+            self._open_server,
+            self.unexpected.append,
+        )
+        self.servers.append(server)
+        return server
+
     def _open(self) -> Session:
         if self._stubs is None:
             raise UsageError("the graph is not open: use `async with Graph() as graph:`")
@@ -230,3 +279,17 @@ class Graph:
         name, kind, _ = service.key
         if all(server.srv_name != name for server in self.servers):
             self.unexpected.append(f"{name} ({kind}) was called, and has no server")
+
+
+def _check_loop(srv_name: str) -> None:
+    """Raise `UsageError` in a function that no loop runs: a plain fixture, or a plain test."""
+    if asyncio._get_running_loop() is not None:
+        return
+    frame = inspect.currentframe()
+    while frame is not None and frame.f_globals.get("__name__", "").startswith("rosasync.testing"):
+        frame = frame.f_back
+    name = "the caller" if frame is None else frame.f_code.co_name
+    raise UsageError(
+        f"{srv_name} cannot be served by {name}, which no event loop runs: make it async "
+        f"(async def {name}), in pytest's strict mode with @pytest_asyncio.fixture for a fixture"
+    )

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Self, TypeAlias
+from typing import TYPE_CHECKING, Any, Generic, Self, TypeAlias
 
 from rosasync._ros.messages import to_dict, to_message
 from rosasync._ros.types import service_type
 from rosasync.testing.faults import Faults, FaultyService, StubCall, set_in_block
 from rosasync.testing.matching import check_fields, count, describe, difference, matches
+from rosasync.typing import RequestT, ResponseT
 
 if TYPE_CHECKING:
     from rosasync._server.server import ServiceServer
@@ -49,7 +50,7 @@ class _Rule:
         return self.answers[0] if self.repeated else self.answers.pop(0)
 
 
-class StubServer:
+class StubServer(Generic[RequestT, ResponseT]):
     """A server in a `Graph`; created by `Graph.serve` and `Graph.stub`.
 
     It is a `rosasync.ServiceServer` on the graph's own node, in memory or on real ROS. Confined to
@@ -67,10 +68,10 @@ class StubServer:
         handler: Any,
         options: Mapping[str, Any],
         optional: bool,
-        open_server: Callable[..., ServiceServer[Any, Any]],
+        open_server: Callable[..., ServiceServer[RequestT, ResponseT]],
         on_unexpected: Callable[[str], None],
     ) -> None:
-        self.calls: list[StubCall] = []
+        self.calls: list[StubCall[RequestT, ResponseT]] = []
         self.optional = optional
         self._type = service_type(srv_type)
         self._name = srv_name
@@ -87,7 +88,7 @@ class StubServer:
         state = "vanished" if self._server.closed else "up"
         return f"<StubServer {self.srv_name} {state}, {count(len(self.calls), 'call')}>"
 
-    async def __aiter__(self) -> AsyncIterator[ServiceCall[Any, Any]]:
+    async def __aiter__(self) -> AsyncIterator[ServiceCall[RequestT, ResponseT]]:
         """Iterate over the calls, if `Graph.serve` was given no handler."""
         async for call in self._server:
             yield call
@@ -98,7 +99,7 @@ class StubServer:
         return self._server.srv_name
 
     @property
-    def server(self) -> ServiceServer[Any, Any]:
+    def server(self) -> ServiceServer[RequestT, ResponseT]:
         """The server itself; another one after `come_back`."""
         return self._server
 
@@ -203,14 +204,22 @@ class StubServer:
         self._faults.held.clear()
         await self._server.aclose(timeout=0)
 
-    def come_back(self) -> None:
-        """Enter the graph again, as a node that was restarted; does nothing if it is there."""
+    def come_back(self) -> Awaitable[None]:
+        """Enter the graph again, as a node that was restarted; does nothing if it is there.
+
+        To be awaited, as `vanish`. It has come back as soon as this returns.
+        """
         if self._server.closed:
             self._server = self._open()
+        done = asyncio.get_running_loop().create_future()
+        done.set_result(None)
+        return done
 
     # What was called.
 
-    async def wait_for_calls(self, number: int = 1, timeout: float = 10.0) -> list[StubCall]:
+    async def wait_for_calls(
+        self, number: int = 1, timeout: float = 10.0
+    ) -> list[StubCall[RequestT, ResponseT]]:
         """Wait until it has received a number of requests, and return them.
 
         Raises:
@@ -288,7 +297,7 @@ class StubServer:
 
     # Serving.
 
-    def _open(self) -> ServiceServer[Any, Any]:
+    def _open(self) -> ServiceServer[RequestT, ResponseT]:
         return self._open_server(
             lambda opener, service, deliver: FaultyService(
                 opener, service, deliver, self._faults, self._on_call
@@ -299,7 +308,7 @@ class StubServer:
             **self._options,
         )
 
-    def _on_call(self, call: StubCall) -> None:
+    def _on_call(self, call: StubCall[RequestT, ResponseT]) -> None:
         self.calls.append(call)
         self._changed.set()
 

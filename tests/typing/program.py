@@ -5,12 +5,13 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Mapping
 from concurrent.futures import Future
-from typing import Any, assert_type
+from typing import Any, Literal, assert_type
 
 from std_srvs.srv import SetBool, Trigger
 
 import rosasync
 from rosasync import AsyncServiceProxy, LeasedClient, ServiceCall, ServiceClient, ServiceServer
+from rosasync.testing import Graph, StubServer
 
 NAME = "std_srvs/srv/SetBool"
 
@@ -102,6 +103,17 @@ def ticks(session: rosasync.Session) -> None:
     assert_type(proxy, AsyncServiceProxy[SetBool.Request, SetBool.Response])
     proxy.call_service(SetBool.Request(data=True), timeout=2.0)
     assert_type(proxy.get_response(), SetBool.Response | None)
+
+
+async def tests(graph: Graph) -> None:
+    stub = graph.stub(SetBool, "/arm/enable", {"success": True})
+    assert_type(stub, StubServer[SetBool.Request, SetBool.Response])
+    assert_type(stub.calls[0].request, SetBool.Request)
+    served = graph.serve(SetBool, "/arm/enable", plain)
+    assert_type(served, StubServer[SetBool.Request, SetBool.Response])
+    assert_type(graph.stub(NAME, "/arm/enable"), StubServer[Any, Any])
+    async with graph.session() as session:
+        assert_type(await session.wait_for_service(SetBool, "/arm/enable"), Literal[True])
 
 
 async def generic(

@@ -47,7 +47,7 @@ async def test_the_services_of_a_node(ros_graph: Graph) -> None:
 
             await blink.vanish()
             await until(pilot, lambda: cells("service") == ["/lamp/switch"])
-            blink.come_back()
+            await blink.come_back()
             await until(pilot, lambda: cells("service") == ["/lamp/blink", "/lamp/switch"])
 
             app.table.move_cursor(row=1)
