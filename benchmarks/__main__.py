@@ -33,6 +33,7 @@ Pin = Annotated[
 Chosen = Annotated[str, typer.Option("--contestants", help="Only these contestants: a,b,c.")]
 
 SUITE_COMMANDS = {
+    "headline": "What the README shows: one call and eight at once, to two servers.",
     "latency": "The time of a call, calls at once, idle clients, idle CPU and memory.",
     "throughput": "The calls per second of 1, 8, 64 and 512 callers.",
     "scale": "Many services, idle clients, large responses and slow servers.",
@@ -80,7 +81,7 @@ def allocations(quick: Quick = False, rounds: Rounds = None, json: Json = None) 
 add_command(
     "all",
     "All measurements.",
-    [name for name in SUITES if name != "targets"],
+    [name for name in SUITES if name not in ("headline", "targets")],
     and_allocations=True,
 )
 

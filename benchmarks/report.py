@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from benchmarks.allocations import allocation_rows
 from benchmarks.contestants import CONTESTANTS
 from benchmarks.figures import METRICS, figure
+from benchmarks.headline import conclusions, draw_headline, headline_rows
 from benchmarks.pages import markdown_table, marked_sections
 from benchmarks.results import Results, Turn
 from benchmarks.tables import describe, rows
@@ -28,18 +29,16 @@ POINTS = 400
 FEATURED = ("direct", "direct-uvloop", "executor", "call", "call-multi", "to-thread", "floor")
 """The contestants of a plot that would show more than these. The tables have all of them."""
 
-INTRODUCTION = """\
-# Benchmarks
+METHOD = """\
+## Method
 
-Written by `python -m benchmarks report`; do not edit.
-
-Contestants alternate in rounds within one run. Each runs in its own process, which is set up before
-a turn and cleaned up after it. Latencies are measured around each call, with the caller's clock.
-The 99th and 99.9th percentiles are those of all rounds' calls together. Every other figure is the
-median over the rounds. CPU time and context switches are those of the whole process, including the
-middleware's threads. A ratio is computed in each round; the tables have its median over the rounds,
-and the lowest and highest value. The times are valid for the machine below. The ratios are more
-portable.
+`python -m benchmarks report` writes this page from saved results. Contestants alternate in rounds
+within one run. Each runs in its own process, which is set up before a turn and cleaned up after it.
+Latencies are measured around each call, with the caller's clock. The 99th and 99.9th percentiles
+are those of all rounds' calls together. Every other figure is the median over the rounds. CPU time
+and context switches are those of the whole process, including the middleware's threads. A ratio is
+computed in each round; the tables have its median over the rounds, and the lowest and highest
+value. The times are valid for the machine below. The ratios are more portable.
 """
 
 
@@ -47,7 +46,7 @@ def write_report(results: Results, out: Path) -> Path:
     """Write the page and its plots to `out`, and return the path of the page."""
     page = out / "benchmarks.md"
     out.mkdir(parents=True, exist_ok=True)
-    sections = [INTRODUCTION, *_machine(results), *_targets(results)]
+    sections = ["# Benchmarks\n", *_opening(results, out), *_targets(results)]
     plots = write_plots(results, out / "benchmarks")
     for scenario in results.scenarios:
         what = describe(results.scenarios[scenario])
@@ -63,6 +62,7 @@ def write_report(results: Results, out: Path) -> Path:
     for part in results.allocations[0] if results.allocations else ():
         sections += [f"## Allocations: {part}\n", markdown_table(*allocation_rows(results, part))]
     sections += marked_sections(page.read_text()) if page.exists() else []
+    sections += [METHOD, *_machine(results)]
     page.write_text("\n".join(sections))
     return page
 
@@ -176,6 +176,20 @@ def _color(i: int) -> Any:
 
 def _pooled(turns: Iterable[Turn]) -> list[float]:
     return [sample / 1e3 for turn in turns for sample in turn.samples]
+
+
+def _opening(results: Results, out: Path) -> Iterator[str]:
+    if sentences := list(conclusions(results)):
+        yield "\n".join(f"- {sentence}" for sentence in sentences) + "\n"
+        (out / "diagrams").mkdir(exist_ok=True)
+        draw_headline(results, out / "diagrams" / "benchmark.svg")
+        yield "![Latency and throughput with two servers](diagrams/benchmark.svg)\n"
+        yield markdown_table(*headline_rows(results))
+    verdicts = list(judge(results))
+    if missed := [verdict.target.name for verdict in verdicts if verdict.met is False]:
+        yield f"{len(verdicts) - len(missed)} of {len(verdicts)} targets are met. Missed: " + (
+            "; ".join(missed) + ".\n"
+        )
 
 
 def _machine(results: Results) -> Iterator[str]:

@@ -24,6 +24,7 @@ MANY_AT_ONCE = tuple(key for key in ALL if key != "process-per-call")
 LEADING = ("direct", "direct-uvloop", "executor", "call", "afor-qos", "floor")
 POLLING = (*LEADING, "direct-busy", "busy")
 BRIDGES = ("direct", "executor")
+HEADLINE = ("direct-uvloop", "direct", "call", "to-thread", "call-multi")
 
 LEAN = Work(server="lean")
 SOAK = Work(server="lean", services=2, delays=(0.0, 0.003))
@@ -43,6 +44,13 @@ def _latency() -> list[Scenario]:
         *_idle("direct"),
         *_memory("direct"),
     ]
+
+
+def _headline() -> list[Scenario]:
+    """Return what the README shows: one call and eight at once, to each of two servers."""
+    eight = dataclasses.replace(_callers(8), key="8 callers, stock server", work=Work())
+    every = [Scenario("one at a time", "one at a time", ALL), _callers(1), eight, _callers(8)]
+    return [dataclasses.replace(scenario, contestants=HEADLINE) for scenario in every]
 
 
 def _throughput() -> list[Scenario]:
@@ -190,6 +198,7 @@ def _targets() -> list[Scenario]:
 
 
 SUITES: dict[str, Callable[[], list[Scenario]]] = {
+    "headline": _headline,
     "latency": _latency,
     "throughput": _throughput,
     "scale": _scale,

@@ -265,8 +265,17 @@ def test_a_report_keeps_the_marked_sections(tmp_path: Path) -> None:
     page = tmp_path / "benchmarks.md"
     page.write_text("former\n<!-- cold -->\nkept\n<!-- /cold -->\n")
     write_report(results_of(suites()["one at a time"], {"direct": [5]}), tmp_path)
-    assert page.read_text().endswith("<!-- cold -->\nkept\n<!-- /cold -->\n")
+    assert "<!-- cold -->\nkept\n<!-- /cold -->\n" in page.read_text()
     assert "former" not in page.read_text()
+
+
+def test_a_report_opens_with_its_conclusions(tmp_path: Path) -> None:
+    one = suites()["one at a time"]
+    page = write_report(results_of(one, {"direct": [50], "call": [200]}), tmp_path).read_text()
+    said = "- With a stock server, one at a time: 0.25 times (asyncio) the median latency of"
+    assert page.startswith(f"# Benchmarks\n\n{said} `client.call`.\n")
+    assert page.index("diagrams/benchmark.svg") < page.index("## Method") < page.index("## Machine")
+    assert (tmp_path / "diagrams" / "benchmark.svg").exists()
 
 
 def test_a_process_is_ready_at_its_own_line() -> None:
