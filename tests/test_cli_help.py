@@ -16,7 +16,7 @@ from tests.support.process import ROOT, ended
 
 COMMANDS = [
     *("call", "list", "type", "find", "show", "info", "nodes"),
-    *("serve", "watch", "bench", "ping", "why", "doctor", "profile", "demo"),
+    *("serve", "watch", "bench", "ping", "why", "doctor", "profile", "run", "demo"),
 ]
 GROUPS = ["param", "lifecycle"]
 """The commands that have commands of their own, tested in test_cli_nodes.py."""

@@ -131,18 +131,19 @@ def test_a_good_offset_is_kept(folder: Path) -> None:
 def test_without_shared_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fresh_ports, "FOLDER", Path("/no/such/folder"))
     assert fresh_offset(DOMAIN) is None
-    assert dead_ports() == []
+    assert dead_ports(DOMAIN) == []
 
 
 def test_the_ports_of_the_dead(folder: Path) -> None:
     left = leave(folder, NUMBERS[0])
     unlocked = leave(folder, 7001, lock=False)
-    shared = leave(folder, 7400, lock=False)
+    shared = leave(folder, NUMBERS[2], lock=False)
     shared.with_name(f"{shared.name}_sl").touch()
     close(folder, NUMBERS[4])
     with leave(folder, NUMBERS[1]).open() as alive:
         fcntl.flock(alive, fcntl.LOCK_EX)
-        assert dead_ports() == [unlocked, left.with_name(left.name.removesuffix("_el")), left]
+        leave(folder, NUMBERS[0] + 250)
+        assert dead_ports(DOMAIN) == [unlocked, left.with_name(left.name.removesuffix("_el")), left]
 
 
 CLIENT = f"""

@@ -14,6 +14,7 @@ from typing import Any
 
 import anyio
 import pytest
+import rclpy
 
 from rosasync import Session, SessionClosed, UsageError
 from rosasync._core.aio import call_in_thread
@@ -305,3 +306,16 @@ async def test_ctrl_c_during_the_import() -> None:
     assert "KeyboardInterrupt" in errors.decode()
     assert "terminate called" not in errors.decode()
     assert "it was opened" not in errors.decode()
+
+
+@pytest.mark.parametrize("domain", [233, 1042, 2**32])
+async def test_a_context_of_a_domain_that_does_not_exist(domain: int) -> None:
+    """Fast DDS would end the process."""
+    context = rclpy.context.Context()
+    rclpy.init(context=context, domain_id=domain)
+    try:
+        with pytest.raises(UsageError, match=f"no ROS domain {domain}"):
+            async with Session("nowhere", context=context):
+                pass
+    finally:
+        context.try_shutdown()

@@ -16,6 +16,7 @@ from rosasync._cli.call import call
 from rosasync._cli.demo import demo
 from rosasync._cli.doctor import doctor
 from rosasync._cli.errors import Code, join
+from rosasync._cli.fresh import run_fresh
 from rosasync._cli.listing import find, info, list_services, nodes, type_of
 from rosasync._cli.ping import ping
 from rosasync._cli.profile import profile
@@ -51,6 +52,7 @@ app.command()(ping)
 app.command()(why)
 app.command()(doctor)
 app.command()(profile)
+app.command("run", context_settings={"allow_interspersed_args": False})(run_fresh)
 app.command()(demo)
 app.add_typer(param.app, name="param")
 app.add_typer(lifecycle.app, name="lifecycle")

@@ -18,6 +18,8 @@ from rosasync._cli.options import AsJson
 from rosasync._cli.run import open_session, run
 from rosasync._cli.why import environment
 from rosasync._demo.server import stock_server
+from rosasync._ros.domain import environment_domain
+from rosasync._ros.fresh_ports import dead_ports
 from rosasync._ros.middleware import check_middleware, installed_middlewares
 from rosasync._ros.profile import SWITCH, is_old, profile_variable, switched_off, user_profile
 from rosasync._ros.shared_memory import (
@@ -42,6 +44,11 @@ PROFILE_HINT = (
     "Where packets get lost, give other nodes the profile that repairs it: rosasync profile"
 )
 
+FRESH_HINT = (
+    "A session chooses no port where you have a profile. For processes that are started again "
+    "after a crash: rosasync run -- COMMAND, which adds one to a copy of it"
+)
+
 
 def doctor(as_json: AsJson = False) -> None:
     """Say whether services can work on this machine.
@@ -64,7 +71,7 @@ async def _doctor(as_json: bool) -> int:
         _shared_memory(report)
         _multicast(report)
         _profile(report)
-        if _ports(report):
+        if "domain" not in report.failed and _ports(report):
             await _calls(report)
     return Code.FAILED if report.failed else Code.ANSWERED
 
@@ -109,14 +116,24 @@ def _shared_memory(report: Report) -> None:
 
 
 def _ports(report: Report) -> bool:
-    """Check that no new node would wait forever; return whether one can be created."""
+    """Check the ports in shared memory; return whether a new node can be created."""
     from rosasync._ros.inspect import middleware
 
-    domain = os.environ.get("ROS_DOMAIN_ID") or "0"
-    if "fastrtps" not in middleware() or not domain.isdecimal():
+    if "fastrtps" not in middleware():
         return True
-    if left := unfinished_ports(int(domain)):
+    domain = environment_domain()
+    left = unfinished_ports(domain)
+    if left:
         report.add("ports", False, describe_unfinished(left), removal_command(left))
+    elif dead := dead_ports(domain):
+        report.add(
+            "ports",
+            None,
+            f"dead processes have left {len(dead)} files of ports behind. The next process of the "
+            "same number is reached only after seconds, unless it is a session or was started by "
+            "rosasync run",
+            removal_command(dead),
+        )
     return not left
 
 
@@ -157,7 +174,8 @@ def _profile(report: Report) -> None:
     elif (file := user_profile(old)) and not file.is_file():
         report.add("profile", False, f"{read}={file}", "There is no such file")
     else:
-        report.add("profile", None, _profile_in_use(file), PROFILE_HINT)
+        hint = FRESH_HINT if file else PROFILE_HINT
+        report.add("profile", None, _profile_in_use(file), hint)
 
 
 def _profile_in_use(file: Path | None) -> str:

@@ -7,7 +7,12 @@ from typing import Annotated
 
 import typer
 
+from rosasync._cli.errors import CliError, Code
+from rosasync._cli.fresh import fresh_profile
+from rosasync._cli.run import fail
+from rosasync._ros.domain import environment_domain
 from rosasync._ros.profile import ANNOUNCEMENT, is_old, profile_text, profile_variable
+from rosasync.errors import RosasyncError
 
 __all__ = ["Distribution", "profile"]
 
@@ -24,6 +29,12 @@ def profile(
         Distribution | None,
         typer.Option(help="The nodes' distribution; by default the installed one."),
     ] = None,
+    fresh: Annotated[
+        bool,
+        typer.Option(
+            "--fresh", help="With a port that no dead process has left behind, for one start."
+        ),
+    ] = False,
 ) -> None:
     """Print a Fast DDS profile for the environment of stock nodes.
 
@@ -34,10 +45,21 @@ def profile(
     Examples:
       $ rosasync profile
       $ rosasync profile --distribution kilted
+      $ rosasync profile --fresh
     """
     old = is_old() if distribution is None else distribution is Distribution.JAZZY
-    typer.echo(profile_text(old, announcement=ANNOUNCEMENT), nl=False)
+    try:
+        text = (
+            fresh_profile(environment_domain(), old)
+            if fresh
+            else profile_text(old, announcement=ANNOUNCEMENT)
+        )
+    except (CliError, RosasyncError) as error:
+        fail(error)
+        raise typer.Exit(Code.FAILED) from None
+    typer.echo(text, nl=not text.endswith("\n"))
+    option = " --fresh" if fresh else ""
     typer.echo(
-        f"rosasync profile > profile.xml; export {profile_variable(old)}=$PWD/profile.xml",
+        f"rosasync profile{option} > profile.xml; export {profile_variable(old)}=$PWD/profile.xml",
         err=True,
     )

@@ -11,6 +11,7 @@ from rosasync._cli.errors import Code
 from rosasync._cli.graph import explain_type, is_hidden, resolve, settle
 from rosasync._cli.options import AsJson, Name, OptionalType, Wait
 from rosasync._cli.run import open_session, run
+from rosasync._ros.domain import SAFE, environment_domain
 from rosasync._ros.profile import SWITCH, switched_off
 from rosasync._ros.types import service_type
 
@@ -38,6 +39,8 @@ def why(
 async def _why(name: str, srv_type: str | None, as_json: bool, wait: float | None) -> int:
     report = Report(as_json)
     environment(report)
+    if "domain" in report.failed:
+        return Code.FAILED
     async with open_session() as session:
         resolved = resolve(session, name)
         await settle(session, wait)
@@ -78,8 +81,19 @@ def _switch(report: Report) -> None:
 
 
 def _domain_and_range(report: Report) -> None:
-    domain = os.environ.get("ROS_DOMAIN_ID") or "0"
-    report.add("domain", None, f"{domain} (ROS_DOMAIN_ID); both sides need the same")
+    try:
+        domain = environment_domain()
+    except rosasync.UsageError as error:
+        report.add("domain", False, str(error), "Set ROS_DOMAIN_ID on both sides, or unset it")
+    else:
+        report.add(
+            "domain",
+            None,
+            f"{domain} (ROS_DOMAIN_ID); both sides need the same",
+            ""
+            if domain <= SAFE
+            else f"Domains above {SAFE} have ports that Linux also uses for outgoing connections",
+        )
     if os.environ.get("ROS_LOCALHOST_ONLY") == "1":
         report.add(
             "range",

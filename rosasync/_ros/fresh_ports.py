@@ -76,13 +76,18 @@ def fresh_offset(domain: int, current: int | None = None) -> int | None:
     return None if chosen is None else chosen - metatraffic + UNICAST
 
 
-def dead_ports() -> list[Path]:
-    """Return the files of the ports whose processes are dead, of every domain."""
+def dead_ports(domain: int) -> list[Path]:
+    """Return the files of the ports that a new process of the domain may open and a dead one had.
+
+    Those are the domain's, and those below `BASE`, which are common to all domains.
+    """
     try:
         names = os.listdir(FOLDER)
     except OSError:
         return []
-    numbers = _numbers(names, rf"{port_prefix()}(\d+)(?:{LOCK})?")
+    first = BASE + DOMAIN_GAIN * domain
+    own = {*range(BASE), *range(first, first + DOMAIN_GAIN)}
+    numbers = own & _numbers(names, rf"{port_prefix()}(\d+)(?:{LOCK})?")
     files = [file for number in sorted(numbers) if _is_dead(number) for file in _files(number)]
     return [file for file in files if file.exists()]
 

@@ -33,6 +33,7 @@ from rosasync._core.ports import (
 )
 from rosasync._ros import configuration, discovery, names, profile, rcl
 from rosasync._ros.direct_bridge import DirectBridge
+from rosasync._ros.domain import check_domain, environment_domain
 from rosasync._ros.executor_bridge import ExecutorBridge
 from rosasync._ros.executor_thread import ExecutorThread, ThreadUser, executor_thread_of
 from rosasync._ros.failures import (
@@ -321,6 +322,8 @@ class RosNode:
         except InvalidNodeNameException as error:
             reason = str(error).strip().replace("\n", " ")
             raise ValueError(f"{node!r} is not a valid node name: {reason}") from None
+        except UsageError:
+            raise
         except RuntimeError as error:
             # RCLError, or what C++ throws if the process is out of file descriptors.
             raise RosasyncError(f"rclpy cannot create the node {node!r}: {error}") from error
@@ -330,11 +333,13 @@ class RosNode:
         """Make a node, and a context for it unless one is given."""
         context = given
         if context is None:
+            environment_domain()
             context = self._own_context = Context()
             rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
         if "fastrtps" not in rclpy.get_rmw_implementation_identifier():
             return Node(name, context=context)
         domain = context.get_domain_id()
+        check_domain(domain)
         if given is not None:
             if not discovery.own_ports(domain):
                 check_ports(domain)

@@ -26,6 +26,7 @@ __all__ = [
     "profile_variable",
     "switched_off",
     "user_profile",
+    "with_offset",
 ]
 
 HEARTBEAT = 0.02
@@ -122,6 +123,40 @@ def participant_text(name: str, offset: int) -> str:
     return PROFILE.format(profiles=_participant(name, None, offset), log="")
 
 
+def with_offset(text: str, offset: int) -> str:
+    """Return a user's profiles with an ``offsetd3`` in the default profile for participants.
+
+    Raises:
+        ValueError: it is not XML, or chooses its ports itself.
+    """
+    try:
+        root = ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise ValueError(f"it is not valid XML: {error}") from None
+    namespace = str(root.tag).rpartition("}")[0]
+    prefix = f"{namespace}}}" if namespace else ""
+    if namespace:
+        ElementTree.register_namespace("", namespace.removeprefix("{"))
+    profiles = next((e for e in root.iter() if _tag(e) == "profiles"), root)
+    default = [
+        element
+        for element in profiles
+        if _tag(element) == "participant" and element.get("is_default_profile") == "true"
+    ]
+    attributes = {"profile_name": "rosasync", "is_default_profile": "true"}
+    participant = (
+        default[-1]
+        if default
+        else ElementTree.SubElement(profiles, f"{prefix}participant", attributes)
+    )
+    rtps = _child(participant, prefix, "rtps")
+    port = next((element for element in rtps if _tag(element) == "port"), None)
+    if port is not None and participant.get("profile_name") != attributes["profile_name"]:
+        raise ValueError("its default profile for participants chooses the ports already")
+    _child(_child(rtps, prefix, "port"), prefix, "offsetd3").text = str(offset)
+    return ElementTree.tostring(root, encoding="unicode")
+
+
 def user_profile(old: bool) -> Path | None:
     """Return the profile file that the user has configured, if any.
 
@@ -155,6 +190,12 @@ def _participant(name: str, announcement: float | None, offset: int | None) -> s
     if offset is not None:
         settings += PORT.format(offset=offset)
     return PARTICIPANT.format(name=name, settings=settings)
+
+
+def _child(parent: ElementTree.Element, prefix: str, tag: str) -> ElementTree.Element:
+    """Return the child with this tag; create it if there is none."""
+    found = next((element for element in parent if _tag(element) == tag), None)
+    return ElementTree.SubElement(parent, f"{prefix}{tag}") if found is None else found
 
 
 def _duration(seconds: float) -> dict[str, int]:
