@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from rosasync._actions.goal import Goal
 from rosasync._actions.server import ActionServer
 from rosasync._actions.server_goal import ServerGoal
 from rosasync._actions.status import GoalStatus
@@ -56,6 +57,7 @@ __all__ = [
     "CancelRejected",
     "ClientPool",
     "ContextShutdown",
+    "Goal",
     "GoalAborted",
     "GoalCanceled",
     "GoalError",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from rosasync._actions.goal import Goal
 from rosasync._actions.server import ActionServer
 from rosasync._actions.server_goal import ServerGoal
 from rosasync._actions.status import GoalStatus
@@ -21,6 +22,7 @@ __all__ = [
     "ActionServerStatistics",
     "ActionType",
     "CancelRejected",
+    "Goal",
     "GoalAborted",
     "GoalCanceled",
     "GoalError",

@@ -26,11 +26,15 @@ from rosasync.typing import (
 )
 
 if TYPE_CHECKING:
+    from contextlib import AbstractAsyncContextManager
+    from uuid import UUID
+
     from rclpy.context import Context
     from rclpy.executors import Executor
     from rclpy.node import Node
     from rclpy.qos import QoSProfile
 
+    from rosasync._actions.goal import Goal
     from rosasync._actions.goal_runner import GoalErrorHook, GoalHandler, OnBusy
     from rosasync._actions.intake import CancelHook, GoalHook
     from rosasync._actions.server import ActionServer
@@ -627,11 +631,207 @@ class Session:
             on_error=on_error,
         )
 
+    @overload
+    async def act(
+        self,
+        action_type: ActionType[GoalT, ResultT, FeedbackT],
+        action_name: str,
+        goal: GoalT | Mapping[str, Any] | None = None,
+        *,
+        timeout: float | None = None,
+        accept_timeout: Timeout = ...,
+        wait: bool | float = True,
+        on_feedback: Callable[[FeedbackT], Any] | None = None,
+    ) -> ResultT: ...
+
+    @overload
+    async def act(
+        self,
+        action_type: str,
+        action_name: str,
+        goal: Any = None,
+        *,
+        timeout: float | None = None,
+        accept_timeout: Timeout = ...,
+        wait: bool | float = True,
+        on_feedback: Callable[[Any], Any] | None = None,
+    ) -> Any: ...
+
+    async def act(
+        self,
+        action_type: Any,
+        action_name: str,
+        goal: Any = None,
+        *,
+        timeout: float | None = None,
+        accept_timeout: Timeout = ...,
+        wait: bool | float = True,
+        on_feedback: Callable[[Any], Any] | None = None,
+    ) -> Any:
+        """Send a goal to an action, wait until it has ended, and return its result.
+
+        If this is cancelled, or the timeout passes, the goal is cancelled on its server, whether it
+        was accepted by then or not. The caller does not wait for that.
+
+        Args:
+            action_type: an action class or its name, ``"nav2_msgs/action/NavigateToPose"``. With a
+                class, type checkers know the result.
+            action_name: the action's name. Relative and private (``~/name``) names work.
+            goal: a message of the goal type, a mapping of its fields, or None for an empty one.
+            timeout: seconds for all of it; None for no deadline, because a goal may run for hours.
+            accept_timeout: seconds until the goal is accepted, with the time to find the server;
+                None for no deadline; if left out, the session's timeout.
+            wait: False to fail at once if there is no server; or the number of seconds to wait for
+                one within ``accept_timeout``.
+            on_feedback: ``on_feedback(feedback)``, plain or async, called for each feedback
+                message. If it raises, the goal is cancelled.
+
+        Raises:
+            GoalRejected: the server did not accept the goal.
+            GoalAborted, GoalCanceled: it has ended without success; ``error.result`` is its result.
+            GoalTimeout: it was not accepted, or has not ended, in time.
+            ServiceUnavailable: there was no server in time.
+            ServerGone: every server vanished while the goal was out.
+            SessionClosed, ContextShutdown: the session ended, before or during the goal.
+            InvalidServiceName: ROS does not allow the name.
+            TypeError, ValueError: an argument does not fit; nothing was sent.
+            UsageError: called from another loop or thread.
+        """
+        core = self._use()
+        seconds = check_timeout(timeout, None)
+        arguments = core.actions.arguments(action_type, action_name, goal, accept_timeout, wait)
+        return await core.actions.act(arguments, seconds, on_feedback)
+
+    @overload
+    def goal(
+        self,
+        action_type: ActionType[GoalT, ResultT, FeedbackT],
+        action_name: str,
+        goal: GoalT | Mapping[str, Any] | None = None,
+        *,
+        accept_timeout: Timeout = ...,
+        wait: bool | float = True,
+        feedback: int = 10,
+        cancel_timeout: float = 5.0,
+    ) -> AbstractAsyncContextManager[Goal[ResultT, FeedbackT]]: ...
+
+    @overload
+    def goal(
+        self,
+        action_type: str,
+        action_name: str,
+        goal: Any = None,
+        *,
+        accept_timeout: Timeout = ...,
+        wait: bool | float = True,
+        feedback: int = 10,
+        cancel_timeout: float = 5.0,
+    ) -> AbstractAsyncContextManager[Goal[Any, Any]]: ...
+
+    def goal(
+        self,
+        action_type: Any,
+        action_name: str,
+        goal: Any = None,
+        *,
+        accept_timeout: Timeout = ...,
+        wait: bool | float = True,
+        feedback: int = 10,
+        cancel_timeout: float = 5.0,
+    ) -> AbstractAsyncContextManager[Goal[Any, Any]]:
+        """Send a goal for a block, which reads its feedback and its result.
+
+        ::
+
+            async with session.goal(Fibonacci, "/fibonacci", {"order": 8}) as goal:
+                async for feedback in goal:
+                    print(feedback.sequence)
+                result = await goal.result()
+
+        Entering the block sends the goal and waits for its acceptance. A goal that is unfinished at
+        the end of the block is cancelled on its server, whatever ends the block, unless
+        ``goal.detach()`` was called. The block's end then waits for the goal's end, for
+        ``cancel_timeout`` seconds at most; if the task was cancelled, it does not wait, and the
+        session sees to the rest in the background.
+
+        Args:
+            action_type: an action class or its name.
+            action_name: the action's name.
+            goal: as for `act`.
+            accept_timeout: as for `act`.
+            wait: as for `act`.
+            feedback: how many feedback messages are kept until they are read. Then the oldest is
+                dropped, and counted in ``goal.feedback_dropped``.
+            cancel_timeout: seconds to wait for the goal's end at the end of the block.
+
+        Raises:
+            Exception: entering raises as `act`, except `GoalAborted` and `GoalCanceled`.
+        """
+        core = self._use()
+        arguments = core.actions.arguments(action_type, action_name, goal, accept_timeout, wait)
+        return core.actions.goal(arguments, feedback, cancel_timeout)
+
+    @overload
+    def attach(
+        self,
+        action_type: ActionType[GoalT, ResultT, FeedbackT],
+        action_name: str,
+        goal_id: UUID,
+        *,
+        accept_timeout: Timeout = ...,
+        wait: bool | float = True,
+        feedback: int = 10,
+    ) -> AbstractAsyncContextManager[Goal[ResultT, FeedbackT]]: ...
+
+    @overload
+    def attach(
+        self,
+        action_type: str,
+        action_name: str,
+        goal_id: UUID,
+        *,
+        accept_timeout: Timeout = ...,
+        wait: bool | float = True,
+        feedback: int = 10,
+    ) -> AbstractAsyncContextManager[Goal[Any, Any]]: ...
+
+    def attach(
+        self,
+        action_type: Any,
+        action_name: str,
+        goal_id: UUID,
+        *,
+        accept_timeout: Timeout = ...,
+        wait: bool | float = True,
+        feedback: int = 10,
+    ) -> AbstractAsyncContextManager[Goal[Any, Any]]:
+        """Follow a goal that runs already, whoever has sent it. Leaving the block cancels nothing.
+
+        Args:
+            action_type: an action class or its name.
+            action_name: the action's name.
+            goal_id: the goal's identifier, such as ``goal.id`` of another session.
+            accept_timeout: seconds until a server is found; as for `act`.
+            wait: as for `act`.
+            feedback: as for `goal`.
+
+        Raises:
+            TypeError: ``goal_id`` is not a ``uuid.UUID``.
+            Exception: entering raises as `act` if there is no server. If the server does not know
+                the goal, ``goal.result()`` raises `GoalRejected`.
+        """
+        core = self._use()
+        return core.actions.attach(
+            action_type, action_name, goal_id, accept_timeout, wait, feedback
+        )
+
     async def aclose(self) -> None:
         """End the session and everything it started; idempotent.
 
         First the servers end: their handlers have five seconds to finish, and may still call. Then
-        the calls in progress end with `SessionClosed`. A cancellation does not cut this short.
+        the goals that are out are cancelled, except those that were detached, and have five seconds
+        to end. Then the calls in progress end with `SessionClosed`. A cancellation does not cut
+        this short.
         """
         if self._core is None:
             self._closed = True

@@ -8,7 +8,7 @@ import itertools
 import logging
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from contextvars import Context
 from dataclasses import dataclass
 from time import monotonic_ns
@@ -40,10 +40,18 @@ RECHECK_NS = 100_000_000
 
 Side: TypeAlias = Literal["client", "server"]
 Phase: TypeAlias = Literal[
-    "waiting", "queued", "sent", "sent again", "handling", "deferred", "failed"
+    "waiting",
+    "queued",
+    "sent",
+    "sent again",
+    "accepted",
+    "canceling",
+    "handling",
+    "deferred",
+    "failed",
 ]
 Outcome: TypeAlias = Literal[
-    "answered", "timed out", "cancelled", "failed", "dropped", "undeliverable"
+    "answered", "timed out", "cancelled", "failed", "dropped", "undeliverable", "detached"
 ]
 
 T = TypeVar("T")
@@ -159,9 +167,32 @@ class Tracing:
         self.quiet_until = 0
         self._hooks: tuple[Trace, ...] = () if hook is None else (hook,)
         self._log = _LogTrace()
+        self._muted = False
+
+    @contextmanager
+    def muted(self) -> Iterator[None]:
+        """Follow no call that starts in this block: it is a part of a goal, which is followed.
+
+        The block must not await anything. Hooks with a true ``action_calls`` follow these as well.
+        """
+        self._muted = True
+        try:
+            yield
+        finally:
+            self._muted = False
+
+    def follow(self, name: str, type_name: str) -> CallTrace | None:
+        """Start the trace of an action's goal, if something listens."""
+        now = monotonic_ns()
+        listeners = () if now < self.quiet_until else self.listeners(now)
+        if not listeners:
+            return None
+        return CallTrace(listeners, TracedCall(next(_numbers), "client", name, type_name, now))
 
     def listeners(self, now: int) -> tuple[Trace, ...]:
         """Return what listens to a call that starts now."""
+        if self._muted:
+            return tuple(hook for hook in self._hooks if getattr(hook, "action_calls", False))
         if logger.isEnabledFor(logging.DEBUG):
             return (*self._hooks, self._log)
         if not self._hooks:
@@ -376,7 +407,7 @@ def _describe(call: TracedCall, phases: list[CallPhase], end: CallEnd) -> Iterat
         took = _duration(phase.time_ns - since)
         if state in _WAITS:
             yield _WAITS[state].format(took)
-        elif phase.name in ("sent again", "deferred", "failed"):
+        elif phase.name in ("sent again", "accepted", "canceling", "deferred", "failed"):
             yield f"{phase.name} after {took}{_reason(phase.error)}"
         state, since = phase.name, phase.time_ns
     took = _duration(end.time_ns - since)

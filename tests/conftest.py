@@ -21,6 +21,7 @@ from rosasync import Session
 from rosasync._ros.domain import isolate
 from rosasync._ros.shared_memory import unfinished_ports
 from tests.faults.table import pytest_terminal_summary
+from tests.support.action_servers import ActionServerProcess
 from tests.support.clients import ClientProcess
 from tests.support.process import Unanswered
 from tests.support.servers import ServerProcess
@@ -102,6 +103,7 @@ class _Processes:
     def __init__(self) -> None:
         self._server: ServerProcess | None = None
         self._client: ClientProcess | None = None
+        self._actions: ActionServerProcess | None = None
 
     def server(self) -> ServerProcess:
         if self._server is None or not self._server.alive:
@@ -113,8 +115,13 @@ class _Processes:
             self._client = ClientProcess()
         return self._client
 
+    def actions(self) -> ActionServerProcess:
+        if self._actions is None or not self._actions.alive:
+            self._actions = ActionServerProcess()
+        return self._actions
+
     def close(self) -> None:
-        for child in (self._server, self._client):
+        for child in (self._server, self._client, self._actions):
             if child is not None and child.alive:
                 child.close()
 
@@ -134,6 +141,16 @@ def server(processes: _Processes) -> Iterator[ServerProcess]:
     yield server
     if server.alive:
         # If it hangs in the middleware, it has been ended, and the next test gets another.
+        with suppress(Unanswered):
+            server.clear_now()
+
+
+@pytest.fixture
+def action_server(processes: _Processes) -> Iterator[ActionServerProcess]:
+    """A process of stock action servers, without any server yet."""
+    server = processes.actions()
+    yield server
+    if server.alive:
         with suppress(Unanswered):
             server.clear_now()
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import anyio
 
+from rosasync._actions.registry import Actions
 from rosasync._actions.server import ActionServer
 from rosasync._client.pool import ClientPool
 from rosasync._core.aio import until_done
@@ -62,6 +63,9 @@ class Core:
             options.timeout,
             self._context_shut_down,
             self.tracing,
+        )
+        self.actions = Actions(
+            self.node, self.pool, self.tracing, options.timeout, self._context_shut_down
         )
         self.portal = Portal(self.node, self.gateway, self.arguments, self.pool, options.timeout)
         # A server removes itself when it ends, by its `on_end`.
@@ -163,6 +167,7 @@ class Core:
         _warn(warning, session)
 
     def _abandon(self) -> None:
+        self.actions.end(session_closed)
         self.pool.end(session_closed)
         self._clean_up()
 
@@ -195,7 +200,9 @@ class Core:
             # First, while their services can still send the results.
             await asyncio.gather(*(server.aclose() for server in self.action_servers))
             await asyncio.gather(*(server.aclose() for server in self.servers))
+            await self.actions.aclose(session_closed)
         finally:
+            self.actions.end(session_closed)
             self.pool.end(session_closed)
             self._end_servers(session_closed)
             self.node.stop()
@@ -227,8 +234,13 @@ class Core:
             server.check_port()
         for action_server in tuple(self.action_servers):
             action_server.check_ports()
+        try:
+            self.actions.graph_changed()
+        except ContextShutdown:
+            self._context_shut_down()
 
     def _context_shut_down(self) -> None:
+        self.actions.end(ContextShutdown)
         self.pool.end(ContextShutdown)
         self._end_servers(ContextShutdown)
 

@@ -244,6 +244,9 @@ class SubscriptionPort(Protocol):
             ContextShutdown: the node is down.
         """
 
+    def drain(self) -> None:
+        """Deliver what has arrived already, if the loop takes it itself."""
+
     def close(self) -> None:
         """Stop delivering, and destroy the subscription; idempotent."""
 

@@ -89,6 +89,9 @@ class _Subscription:
         self._closed = False
         self._subscription: Any = None
 
+    def drain(self) -> None:
+        """Do nothing: the executor takes the messages."""
+
     def publishers(self) -> int:
         """Return how many publishers are matched."""
         try:
@@ -157,6 +160,10 @@ class DirectSubscription(_Subscription):
                     {"message": f"{self._deliver!r} failed", "exception": error}
                 )
         self._signals.loop.call_soon(self.take)
+
+    def drain(self) -> None:
+        """Take and deliver messages at once."""
+        self.take()
 
     def close(self) -> None:
         """Stop delivering, and have the subscription destroyed; idempotent."""

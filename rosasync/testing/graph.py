@@ -592,7 +592,7 @@ class FakeSubscription:
     def receive(self, message: Any) -> None:
         """Queue a message and deliver it in the next turn of the loop; the oldest may be lost."""
         if not self._queue:
-            self._loop.call_soon(self._deliver_queued)
+            self._loop.call_soon(self.drain)
         self._queue.append(message)
 
     def publishers(self) -> int:
@@ -606,7 +606,8 @@ class FakeSubscription:
             self._queue.clear()
             self.node.graph.subscriptions.remove(self)
 
-    def _deliver_queued(self) -> None:
+    def drain(self) -> None:
+        """Deliver the queued messages."""
         messages = tuple(self._queue)
         self._queue.clear()
         for message in messages:

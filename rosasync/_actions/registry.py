@@ -1,0 +1,241 @@
+"""Actions: the goals of a session, from their arguments to their end."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+from uuid import UUID, uuid4
+
+from rosasync._actions.client import ActionClient
+from rosasync._actions.goal import ActiveGoal, Goal
+from rosasync.errors import CallError, GoalTimeout
+from rosasync.options import check_count, check_seconds, check_timeout
+
+if TYPE_CHECKING:
+    from contextlib import AbstractAsyncContextManager
+
+    from rosasync._client.pool import ClientPool
+    from rosasync._core.ports import Action, NodePort
+    from rosasync.tracing import Tracing
+    from rosasync.typing import Timeout
+
+__all__ = ["ActArguments", "Actions"]
+
+CLOSE_TIMEOUT = 5.0
+"""Seconds for which the end of the session waits for the ends of the goals that it cancels."""
+ACT_FEEDBACK = 1000
+"""Feedback messages kept for ``on_feedback``, while it runs."""
+CANCEL_TIMEOUT = 5.0
+"""Seconds to wait for the end of a cancelled goal at the end of its block."""
+
+
+@dataclass(frozen=True, slots=True)
+class ActArguments:
+    """The checked arguments of a goal.
+
+    Attributes:
+        action: the action.
+        message: the goal message.
+        accept_timeout: seconds until its acceptance, None for no deadline.
+        wait: whether, or for how many seconds, to wait for a server.
+    """
+
+    action: Action
+    message: Any
+    accept_timeout: float | None
+    wait: bool | float
+
+
+class Actions:
+    """The goals of a session. Confined to the loop's thread, except `describe` and `arguments`."""
+
+    def __init__(
+        self,
+        node: NodePort,
+        pool: ClientPool,
+        tracing: Tracing,
+        timeout: float | None,
+        on_shutdown: Callable[[], None],
+    ) -> None:
+        self.on_shutdown = on_shutdown
+        self._loop = asyncio.get_running_loop()
+        self._node = node
+        self._pool = pool
+        self._tracing = tracing
+        self._timeout = timeout
+        self._closing: Callable[[], Exception] | None = None
+        self._clients: dict[tuple[str, str], ActionClient] = {}
+        # Needs no lock: each access is a single operation, which is atomic.
+        self._known: dict[tuple[Any, str], Action] = {}
+
+    def check_open(self) -> None:
+        """Raise the error that callers get, once the session has begun to close."""
+        if self._closing is not None:
+            raise self._closing()
+
+    def describe(self, action_type: Any, action_name: str) -> Action:
+        """Resolve an action; raises as `NodePort.describe_action`. From any thread."""
+        try:
+            return self._known[action_type, action_name]
+        except (KeyError, TypeError):
+            action = self._node.describe_action(action_type, action_name)
+        self._known[action_type, action_name] = action
+        return action
+
+    def arguments(
+        self,
+        action_type: Any,
+        action_name: str,
+        goal: Any,
+        accept_timeout: Timeout,
+        wait: bool | float,
+    ) -> ActArguments:
+        """Check what every way to send a goal takes. From any thread.
+
+        Raises:
+            TypeError, ValueError: an argument does not fit.
+        """
+        action = self.describe(action_type, action_name)
+        message = self._node.make_message(action.action_type.Goal, goal)
+        seconds = check_timeout(accept_timeout, self._timeout)
+        if not isinstance(wait, bool):
+            wait = check_seconds("wait", wait)
+        return ActArguments(action, message, seconds, wait)
+
+    async def act(
+        self,
+        arguments: ActArguments,
+        timeout: float | None,
+        on_feedback: Callable[[Any], Any] | None,
+    ) -> Any:
+        """Send a goal and return its result; see `Session.act`."""
+        goal = self._new_goal()
+        feedback = 1 if on_feedback is None else ACT_FEEDBACK
+        try:
+            async with asyncio.timeout(timeout) as deadline:
+                async with self._pursue(arguments, goal, feedback, CANCEL_TIMEOUT) as handle:
+                    if on_feedback is not None:
+                        async for message in handle:
+                            returned = on_feedback(message)
+                            if inspect.isawaitable(returned):
+                                await returned
+                    return await handle.result()
+        except TimeoutError as error:
+            if not deadline.expired() or isinstance(error, CallError):
+                raise
+            what = f"the goal has not ended within {timeout:.3g} s; it is cancelled"
+            errors = self.client(arguments.action).errors
+            raise errors.goal(GoalTimeout, goal, what) from None
+
+    def goal(
+        self,
+        arguments: ActArguments,
+        feedback: int,
+        cancel_timeout: float,
+    ) -> AbstractAsyncContextManager[Goal[Any, Any]]:
+        """Return the context manager of a goal; see `Session.goal`."""
+        feedback = check_count("feedback", feedback, 1)
+        seconds = check_seconds("cancel_timeout", cancel_timeout)
+        return self._pursue(arguments, self._new_goal(), feedback, seconds)
+
+    @asynccontextmanager
+    async def _pursue(
+        self, arguments: ActArguments, goal: ActiveGoal, feedback: int, cancel_timeout: float
+    ) -> AsyncIterator[Goal[Any, Any]]:
+        client = self.client(arguments.action)
+        queue = client.make_queue(feedback)
+        goal.started = self._loop.time()
+        goal.join(queue)
+        await client.send(goal, arguments.message, arguments.accept_timeout, arguments.wait)
+        cancelled = False
+        try:
+            yield Goal(client, goal, queue, self._timeout)
+        except (asyncio.CancelledError, GeneratorExit):
+            cancelled = True
+            raise
+        finally:
+            client.leave(goal, queue, owns=True)
+            if goal.ending is not None and not cancelled and not goal.ended.is_set():
+                await asyncio.wait((goal.ending,), timeout=cancel_timeout)
+
+    def attach(
+        self,
+        action_type: Any,
+        action_name: str,
+        goal_id: UUID,
+        accept_timeout: Timeout,
+        wait: bool | float,
+        feedback: int,
+    ) -> AbstractAsyncContextManager[Goal[Any, Any]]:
+        """Return the context manager of a goal that runs already; see `Session.attach`."""
+        if not isinstance(goal_id, UUID):
+            raise TypeError(f"goal_id must be a uuid.UUID, not {type(goal_id).__name__}")
+        arguments = self.arguments(action_type, action_name, None, accept_timeout, wait)
+        return self._follow(arguments, goal_id, check_count("feedback", feedback, 1))
+
+    @asynccontextmanager
+    async def _follow(
+        self, arguments: ActArguments, goal_id: UUID, feedback: int
+    ) -> AsyncIterator[Goal[Any, Any]]:
+        client = self.client(arguments.action)
+        queue = client.make_queue(feedback)
+        goal = client.find(goal_id.bytes)
+        if goal is None:
+            goal = ActiveGoal(goal_id, self._loop.time())
+            goal.join(queue)
+            await client.follow(goal, arguments.accept_timeout, arguments.wait)
+        else:
+            goal.join(queue)
+        try:
+            yield Goal(client, goal, queue, self._timeout)
+        finally:
+            client.leave(goal, queue, owns=False)
+
+    def client(self, action: Action) -> ActionClient:
+        """Return the client of an action, created at its first use.
+
+        Raises:
+            SessionClosed, ContextShutdown: the session has ended.
+        """
+        self.check_open()
+        key = action.name, action.type_name
+        client = self._clients.get(key)
+        if client is None:
+            client = ActionClient(action, self._node, self._pool, self._tracing, self)
+            self._clients[key] = client
+        return client
+
+    def graph_changed(self) -> None:
+        """Look for servers that have vanished, because the graph has changed.
+
+        Raises:
+            ContextShutdown: the node is down.
+        """
+        for client in tuple(self._clients.values()):
+            client.on_graph()
+
+    def end(self, make_error: Callable[[], Exception]) -> None:
+        """End every goal with an error; nothing can be cancelled any more. Idempotent."""
+        self._closing = make_error
+        for client in tuple(self._clients.values()):
+            client.end(make_error)
+
+    async def aclose(self, make_error: Callable[[], Exception]) -> None:
+        """Let the callers go, and cancel what is out, except what is detached."""
+        if self._closing is None:
+            self._closing = make_error
+        tasks: set[asyncio.Task[None]] = set()
+        for client in tuple(self._clients.values()):
+            client.close_callers(make_error)
+            ending = [client.abandon(goal) for goal in client.goals]
+            if client.is_provided():
+                tasks.update(task for task in ending if task is not None)
+        if tasks:
+            await asyncio.wait(tasks, timeout=CLOSE_TIMEOUT)
+
+    def _new_goal(self) -> ActiveGoal:
+        return ActiveGoal(uuid4(), self._loop.time())

@@ -1,0 +1,272 @@
+"""A process of stock action servers: ``python -m tests.support.action_servers``.
+
+They are of ``rclpy.action.ActionServer``, spun by a ``MultiThreadedExecutor``. What a goal does is
+in the script of its server, so a test decides when each goal goes on and how it ends.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any, Literal
+from uuid import UUID
+
+from tests.support.process import Child, Unanswered, serve_commands
+from tests.support.times import LIMIT
+
+__all__ = ["FIBONACCI", "ActionServerProcess", "End"]
+
+FIBONACCI = "test_msgs/action/Fibonacci"
+
+End = Literal["succeed", "abort", "raise", "return"]
+"""How a goal ends: as succeeded or aborted, by an exception, or without setting a state."""
+
+
+class ActionServerProcess(Child):
+    """The parent's side of one such process."""
+
+    module = "tests.support.action_servers"
+
+    def __init__(self, node: str = "stock_action_server", **options: Any) -> None:
+        super().__init__(node, **options)
+
+    async def serve(self, name: str, action_type: str = FIBONACCI, **options: Any) -> None:
+        """Create an action server without blocking the loop; the options are `serve_now`'s."""
+        await asyncio.to_thread(self.serve_now, name, action_type, **options)
+
+    def serve_now(
+        self,
+        name: str,
+        action_type: str = FIBONACCI,
+        *,
+        end: End = "succeed",
+        hold: bool = False,
+        feedback: int = 0,
+        rate: float = 0.0,
+        accept: bool = True,
+        accept_delay: float = 0.0,
+        cancel: bool = True,
+        result_timeout: int = 900,
+        mute_results: bool = False,
+    ) -> None:
+        """Create an action server, and return when it exists.
+
+        Args:
+            name: the action's name.
+            action_type: the name of its type.
+            end: how its goals end.
+            hold: whether a goal runs until `release` is called, or until it is cancelled.
+            feedback: how many feedback messages a goal publishes first.
+            rate: how many of them in a second; 0 for as many as it can.
+            accept: whether it accepts goals.
+            accept_delay: seconds before it answers to a goal.
+            cancel: whether it agrees to cancel goals.
+            result_timeout: seconds for which it keeps results.
+            mute_results: whether it never sends a result.
+        """
+        arguments: dict[str, Any] = {
+            "name": name,
+            "action_type": action_type,
+            "end": end,
+            "hold": hold,
+            "feedback": feedback,
+            "rate": rate,
+            "accept": accept,
+            "accept_delay": accept_delay,
+            "cancel": cancel,
+            "result_timeout": result_timeout,
+            "mute_results": mute_results,
+        }
+        try:
+            self.ask_now("serve", patience=LIMIT, **arguments)
+        except Unanswered:
+            self.restart()
+            self.ask_now("serve", **arguments)
+
+    async def stop(self, name: str) -> None:
+        """Destroy the action server."""
+        await self.ask("stop", name=name)
+
+    async def release(self, name: str) -> None:
+        """Let every held goal of the server end, and further ones."""
+        await self.ask("release", name=name)
+
+    async def goals(self, name: str, at_least: int = 0) -> dict[UUID, int]:
+        """Wait until ``at_least`` goals have been accepted; return the status of each so far."""
+        goals: dict[str, int] = await self.ask("goals", name=name, at_least=at_least)
+        return {UUID(key): status for key, status in goals.items()}
+
+    async def running(self, name: str) -> list[UUID]:
+        """Return the goals that have not ended."""
+        return [key for key, status in (await self.goals(name)).items() if status < 4]
+
+    async def forge(self, name: str, goal_id: UUID) -> None:
+        """Publish bytes on the feedback topic that are not a message, for a goal."""
+        await self.ask("forge", name=name, goal_id=goal_id.hex)
+
+    def clear_now(self) -> None:
+        """Destroy all action servers; blocks."""
+        self.ask_now("clear", patience=LIMIT)
+
+
+class _Server:
+    """One action server of the process, and the goals it has accepted."""
+
+    def __init__(self, node: Any, options: dict[str, Any]) -> None:
+        from rclpy.action import ActionServer, CancelResponse, GoalResponse
+        from rclpy.callback_groups import ReentrantCallbackGroup
+
+        from rosasync._ros.action_types import action_type
+
+        self.options = options
+        self.type = action_type(options["action_type"])
+        self.released = threading.Event()
+        self.goals: dict[str, Any] = {}
+        self.accepted = threading.Condition()
+        self._cancel = (CancelResponse.REJECT, CancelResponse.ACCEPT)[options["cancel"]]
+        self._accept = (GoalResponse.REJECT, GoalResponse.ACCEPT)[options["accept"]]
+        self.server = ActionServer(
+            node,
+            self.type,
+            options["name"],
+            self._execute,
+            callback_group=ReentrantCallbackGroup(),
+            goal_callback=self._on_goal,
+            handle_accepted_callback=self._on_accepted,
+            cancel_callback=lambda goal: self._cancel,
+            result_timeout=options["result_timeout"],
+        )
+        if options["mute_results"]:
+            self.server._execute_get_result_request = self._ignore
+
+    def statuses(self) -> dict[str, int]:
+        return {key: goal() for key, goal in dict(self.goals).items()}
+
+    async def _ignore(self, request: Any) -> None:
+        """Answer to no request for a result."""
+
+    def _on_goal(self, goal: Any) -> Any:
+        time.sleep(self.options["accept_delay"])
+        return self._accept
+
+    def _on_accepted(self, goal: Any) -> None:
+        last = [0]
+
+        def status() -> int:
+            # The handle is destroyed when the result expires.
+            with suppress(Exception):
+                last[0] = goal.status
+            return last[0]
+
+        with self.accepted:
+            self.goals[bytes(goal.goal_id.uuid).hex()] = status
+            self.accepted.notify_all()
+        goal.execute()
+
+    def _execute(self, goal: Any) -> Any:
+        options = self.options
+        for number in range(options["feedback"]):
+            self._publish(goal, number)
+            if options["rate"]:
+                time.sleep(1 / options["rate"])
+        while options["hold"] and not self.released.wait(0.01):
+            if goal.is_cancel_requested:
+                goal.canceled()
+                return self._result(goal, 1)
+        if options["end"] == "succeed":
+            goal.succeed()
+        elif options["end"] == "abort":
+            goal.abort()
+        elif options["end"] == "raise":
+            raise RuntimeError("the goal fails")
+        return self._result(goal, getattr(goal.request, "order", 0))
+
+    def _publish(self, goal: Any, number: int) -> None:
+        feedback = self.type.Feedback()
+        if hasattr(feedback, "sequence"):
+            feedback.sequence = [number]
+        goal.publish_feedback(feedback)
+
+    def _result(self, goal: Any, order: int) -> Any:
+        result = self.type.Result()
+        if hasattr(result, "sequence"):
+            result.sequence = list(range(order))
+        else:
+            result.nested_field.int32_value = goal.request.nested_field.int32_value
+        return result
+
+
+class _Servers:
+    """The child's side: the commands, run in the thread that reads them."""
+
+    def __init__(self, node: Any, executor: Any) -> None:
+        self._node = node
+        self._executor = executor
+        self._servers: dict[str, _Server] = {}
+
+    def commands(self) -> dict[str, Callable[..., Any]]:
+        names = ("serve", "stop", "release", "goals", "forge", "clear")
+        return {name: getattr(self, name) for name in names}
+
+    def serve(self, **options: Any) -> None:
+        self._servers[options["name"]] = _Server(self._node, options)
+
+    def stop(self, name: str) -> None:
+        server = self._servers.pop(name)
+        # In a thread that spins: rclpy has crashed on changes from another one.
+        done = threading.Event()
+        task = self._executor.create_task(server.server.destroy)
+        task.add_done_callback(lambda _: done.set())
+        assert done.wait(LIMIT), "the executor of the action servers is stuck"
+        server.released.set()
+
+    def release(self, name: str) -> None:
+        self._servers[name].released.set()
+
+    def goals(self, name: str, at_least: int) -> dict[str, int]:
+        server = self._servers[name]
+        with server.accepted:
+            server.accepted.wait_for(lambda: len(server.goals) >= at_least, LIMIT)
+        assert len(server.goals) >= at_least, f"{len(server.goals)} < {at_least}"
+        return server.statuses()
+
+    def forge(self, name: str, goal_id: str) -> None:
+        feedback = self._servers[name].type.Impl.FeedbackMessage
+        publisher = self._node.create_publisher(feedback, f"{name}/_action/feedback", 10)
+        deadline = time.monotonic() + LIMIT
+        while not publisher.get_subscription_count() and time.monotonic() < deadline:
+            time.sleep(0.01)
+        publisher.publish(b"\0\1\0\0" + bytes.fromhex(goal_id) + b"\xff\xff")
+        publisher.publish(b"\0\1\0\0")
+        self._node.destroy_publisher(publisher)
+
+    def clear(self) -> None:
+        for name in tuple(self._servers):
+            self.release(name)
+            self.stop(name)
+
+
+def main() -> None:
+    import rclpy
+    from rclpy.executors import MultiThreadedExecutor
+    from rclpy.signals import SignalHandlerOptions
+
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    node = rclpy.create_node(sys.argv[1])
+    executor = MultiThreadedExecutor(8)
+    executor.add_node(node)
+    spinner = threading.Thread(target=executor.spin)
+    spinner.start()
+    servers = _Servers(node, executor)
+    serve_commands(servers.commands())
+    servers.clear()
+    rclpy.shutdown()
+    spinner.join()
+
+
+if __name__ == "__main__":
+    main()
