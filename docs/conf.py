@@ -6,6 +6,7 @@ Build it with ``sphinx-build -W docs site``.
 from __future__ import annotations
 
 import re
+from importlib import metadata
 from typing import Any
 
 from docutils import nodes
@@ -18,6 +19,7 @@ import rosasync
 project = "rosasync"
 author = "The rosasync authors"
 project_copyright = author
+release = version = metadata.version("rosasync")
 
 extensions = [
     "myst_parser",
@@ -28,8 +30,10 @@ extensions = [
 exclude_patterns = ["site"]
 
 html_theme = "furo"
-html_title = "rosasync"
+html_title = f"rosasync {release}"
 html_copy_source = False
+html_static_path = ["_static"]
+html_css_files = ["narrow.css"]
 
 myst_heading_anchors = 3
 
