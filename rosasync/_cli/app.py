@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import sys
 from importlib.metadata import PackageNotFoundError, version
@@ -20,9 +19,11 @@ from rosasync._cli.fresh import run_fresh
 from rosasync._cli.listing import find, info, list_services, nodes, type_of
 from rosasync._cli.ping import ping
 from rosasync._cli.profile import profile
-from rosasync._cli.run import fail, silence_stdout
+from rosasync._cli.run import fail, interrupted
 from rosasync._cli.serve import serve
 from rosasync._cli.show import show
+from rosasync._cli.signals import handle_signals
+from rosasync._cli.streams import OutputError, prepare_streams, silence_stdout
 from rosasync._cli.watch import watch
 from rosasync._cli.why import why
 
@@ -60,7 +61,8 @@ app.add_typer(lifecycle.app, name="lifecycle")
 
 def main() -> int:
     """Run the command line and return the exit code."""
-    _keep_stdout()
+    handle_signals()
+    prepare_streams()
     try:
         arguments = sys.argv[1:] or ["--help"]
         code = app(arguments, prog_name="rosasync", standalone_mode=False) or 0
@@ -69,30 +71,15 @@ def main() -> int:
         fail(_line_of(error))
         code = Code.USAGE
     except (KeyboardInterrupt, typer.Abort):
-        code = Code.INTERRUPTED
-    except BrokenPipeError:
+        code = interrupted()
+    except OutputError as error:
         silence_stdout()
-        code = Code.PIPE_CLOSED
+        code = error.code
+        if code is not Code.PIPE_CLOSED:
+            fail(error)
     # The interpreter takes some milliseconds to end: a Ctrl-C then prints no traceback.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     return int(code)
-
-
-def _keep_stdout() -> None:
-    """Keep standard output for results: Fast DDS prints its messages there, from C++.
-
-    They go to standard error instead.
-    """
-    if sys.stdout is not sys.__stdout__ or sys.__stdout__ is None:
-        return
-    sys.stdout = open(  # noqa: SIM115 - until the process ends
-        os.dup(1),
-        "w",
-        encoding=sys.__stdout__.encoding,
-        errors="replace",  # for terminals without Unicode
-        buffering=1,
-    )
-    os.dup2(2, 1)
 
 
 def _line_of(error: Any) -> str:

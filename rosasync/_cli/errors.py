@@ -18,7 +18,6 @@ class Code(IntEnum):
     NO_SERVER = 3
     TIMED_OUT = 4
     SERVER_GONE = 5
-    INTERRUPTED = 130
     PIPE_CLOSED = 141
 
 

@@ -41,26 +41,52 @@ async def switched_on(session: rosasync.Session, name: str) -> AsyncIterator[Non
 
     If it cannot be switched on, say how.
     """
-    from rosasync._ros.inspect import client_endpoints, count_publishers, server_endpoints
-
-    await settle(session)
-    switched: list[tuple[str, str, Any]] = []
-    if not count_publishers(session.node, f"{name}/_service_event"):
-        endpoints = [("server", e) for e in server_endpoints(session.node, name)]
-        endpoints += [("client", e) for e in client_endpoints(session.node, name)]
-        for role, node in dict.fromkeys((role, e.node) for role, e in endpoints if e.node):
-            before = await _switch(session, node, PARAMETERS[role])
-            if before is not None:
-                switched.append((node, PARAMETERS[role], before))
-        if not (switched and await _is_published(session, name)):
-            note(HOW.format(name=name))
+    switched: list[tuple[str, str, str]] = []
     try:
+        await _switch_all(session, name, switched)
         yield
     finally:
         for node, parameter, before in switched:
+            # Also after a second Ctrl-C, as far as that lets it.
             with suppress(rosasync.RosasyncError, asyncio.CancelledError):
                 await _set(session, node, parameter, before)
                 note(f"{node}: {parameter} is '{before}' again")
+
+
+async def _switch_all(
+    session: rosasync.Session, name: str, switched: list[tuple[str, str, str]]
+) -> None:
+    """Switch introspection on unless it is published.
+
+    Args:
+        session: an open session.
+        name: the service.
+        switched: gets the node, the parameter and its value before, of what has to be set back.
+    """
+    from rosasync._ros.inspect import client_endpoints, count_publishers, server_endpoints
+
+    await settle(session)
+    if count_publishers(session.node, f"{name}/_service_event"):
+        return
+    endpoints = [("server", e) for e in server_endpoints(session.node, name)]
+    endpoints += [("client", e) for e in client_endpoints(session.node, name)]
+    done = False
+    for role, node in dict.fromkeys((role, e.node) for role, e in endpoints if e.node):
+        parameter = PARAMETERS[role]
+        try:
+            before = await _value_of(session, node, parameter)
+            if before is None:
+                continue
+            # Noted first: a request that is interrupted, or not answered, may still be carried out.
+            switched.append((node, parameter, before))
+            await _set(session, node, parameter, CONTENTS)
+        except rosasync.RosasyncError as error:
+            note(f"{node}: {parameter} could not be set: {error}")
+        else:
+            done = True
+            note(f"{node}: {parameter} set to '{CONTENTS}' until the end")
+    if not (done and await _is_published(session, name)):
+        note(HOW.format(name=name))
 
 
 async def _is_published(session: rosasync.Session, name: str) -> bool:
@@ -75,26 +101,20 @@ async def _is_published(session: rosasync.Session, name: str) -> bool:
     return True
 
 
-async def _switch(session: rosasync.Session, node: str, parameter: str) -> str | None:
-    """Make a node publish contents; return its parameter's value before, None if it has none."""
+async def _value_of(session: rosasync.Session, node: str, parameter: str) -> str | None:
+    """Return the value of a node's parameter; None if it has no such text, or no parameters."""
     from rosasync._ros.inspect import served_types
 
     if not served_types(session.node, f"{node}/get_parameters"):
         return None
-    try:
-        answer: Any = await session.call(
-            "rcl_interfaces/srv/GetParameters",
-            f"{node}/get_parameters",
-            {"names": [parameter]},
-            timeout=TIMEOUT,
-        )
-        if not answer.values or answer.values[0].type != STRING:
-            return None
-        await _set(session, node, parameter, CONTENTS)
-    except rosasync.RosasyncError as error:
-        note(f"{node}: {parameter} could not be set: {error}")
+    answer: Any = await session.call(
+        "rcl_interfaces/srv/GetParameters",
+        f"{node}/get_parameters",
+        {"names": [parameter]},
+        timeout=TIMEOUT,
+    )
+    if not answer.values or answer.values[0].type != STRING:
         return None
-    note(f"{node}: {parameter} set to '{CONTENTS}' until the end")
     return str(answer.values[0].string_value)
 
 

@@ -6,7 +6,7 @@ import asyncio
 import re
 import sys
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 from rosasync._cli.documents import dump_json, dump_yaml
@@ -44,7 +44,9 @@ def print_value(value: object, *, as_json: bool, separate: bool = False) -> None
 
 def note(text: str) -> None:
     """Print a remark to standard error."""
-    print(text, file=sys.stderr, flush=True)
+    # A remark that cannot be shown must not end what it is about.
+    with suppress(OSError):
+        print(text, file=sys.stderr, flush=True)
 
 
 def console() -> Console:

@@ -16,9 +16,11 @@ import typer
 
 import rosasync
 from rosasync._cli.errors import CliError, Code, code_of, line_of
+from rosasync._cli.signals import ended_by, interruptible
+from rosasync._cli.streams import OutputError
 from rosasync._client.mismatch import MISMATCH_LOGGER
 
-__all__ = ["fail", "open_session", "run", "silence_stdout"]
+__all__ = ["fail", "interrupted", "open_session", "run"]
 
 
 def run(command: Coroutine[Any, Any, int | None]) -> None:
@@ -32,15 +34,19 @@ def run(command: Coroutine[Any, Any, int | None]) -> None:
     try:
         code = asyncio.run(_woken_by_signals(command)) or Code.ANSWERED
         sys.stdout.flush()
-    except KeyboardInterrupt:
-        code = Code.INTERRUPTED
-    except BrokenPipeError:
-        silence_stdout()
-        code = Code.PIPE_CLOSED
+    except (KeyboardInterrupt, asyncio.CancelledError):
+        raise typer.Exit(interrupted()) from None
+    except OutputError:
+        raise
     except (CliError, rosasync.RosasyncError, ImportError) as error:
         fail(error)
         code = code_of(error)
     raise typer.Exit(int(code))
+
+
+def interrupted() -> int:
+    """Return the exit code of a command that a signal has ended: as a shell reports it."""
+    return 128 + ended_by()
 
 
 async def _woken_by_signals(command: Coroutine[Any, Any, int | None]) -> int | None:
@@ -57,7 +63,8 @@ async def _woken_by_signals(command: Coroutine[Any, Any, int | None]) -> int | N
         loop.add_reader(reader, reader.recv, 4096)
         previous = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
         try:
-            return await command
+            with interruptible():
+                return await command
         finally:
             signal.set_wakeup_fd(previous)
             loop.remove_reader(reader)
@@ -77,8 +84,3 @@ def fail(error: BaseException | str) -> None:
     text = error if isinstance(error, str) else line_of(error)
     with suppress(OSError):
         print(f"rosasync: {text}", file=sys.stderr, flush=True)
-
-
-def silence_stdout() -> None:
-    """Let what is still buffered go nowhere, because the reader has closed the pipe."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -23,6 +23,7 @@ from rosasync._cli.options import AsJson, Name, Type
 from rosasync._cli.output import note, print_value
 from rosasync._cli.requests import message_from
 from rosasync._cli.run import open_session, run
+from rosasync._cli.streams import OutputError
 from rosasync._ros.fields import field_types
 
 __all__ = ["serve"]
@@ -125,7 +126,7 @@ def _printing(
         request = getattr(arguments[0], "request", arguments[0])
         try:
             print_value(plain(request), as_json=as_json, separate=printed > 0)
-        except OSError as error:
+        except OutputError as error:
             if not failure.done():
                 failure.set_exception(error)
         printed += 1
