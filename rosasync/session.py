@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from rosasync._core.ports import NodePort
     from rosasync._ros.node import RosNode
     from rosasync._server.handlers import ErrorHook, Handler, OverloadHook
-    from rosasync._server.server import ServiceServer
+    from rosasync._server.server import Order, ServiceServer
     from rosasync.tracing import Trace
 
 __all__ = ["ServiceClient", "Session"]
@@ -442,6 +442,7 @@ class Session:
         concurrency: int = 100,
         backlog: int = 1000,
         backlog_bytes: int = 64_000_000,
+        order: Order = "fair",
         qos: QoSProfile | None = None,
         on_error: ErrorHook[RequestT, ResponseT] | None = None,
         on_overload: OverloadHook[RequestT, ResponseT] | None = None,
@@ -457,6 +458,7 @@ class Session:
         concurrency: int = 100,
         backlog: int = 1000,
         backlog_bytes: int = 64_000_000,
+        order: Order = "fair",
         qos: QoSProfile | None = None,
         on_error: ErrorHook[Any, Any] | None = None,
         on_overload: OverloadHook[Any, Any] | None = None,
@@ -471,6 +473,7 @@ class Session:
         concurrency: int = 100,
         backlog: int = 1000,
         backlog_bytes: int = 64_000_000,
+        order: Order = "fair",
         qos: QoSProfile | None = None,
         on_error: ErrorHook[Any, Any] | None = None,
         on_overload: OverloadHook[Any, Any] | None = None,
@@ -493,23 +496,30 @@ class Session:
                 ``handler(call)`` with a `ServiceCall`, which returns the response, or None if the
                 call is answered with ``call.respond``, now or later. None for
                 ``async for call in server:``. The number of required arguments decides, once, at
-                registration. A plain handler blocks the loop while it runs.
+                registration. A plain handler blocks the loop while it runs. Instead of the
+                response it may return a mapping of the response's fields.
             concurrency: the maximum number of handlers that run at a time.
             backlog: the maximum number of requests that wait for a handler.
             backlog_bytes: the maximum size of these requests together, in bytes. A single request
-                may be larger.
+                may be larger. If more come, the oldest is dropped, of the client that has most.
+            order: in which order they run while the server is overloaded. ``"fair"``: the clients
+                take turns, and the newest request of each comes first, because the oldest is the
+                one whose caller has most likely left. ``"arrival"``: first come, first served, as
+                at all other times; for requests that must run in their order, or whose callers wait
+                for as long as it takes.
             qos: a ``QoSProfile``; None for the service default with a history of 1,000.
             on_error: ``on_error(call, error)``, plain or async, called when the handler has raised
-                an exception or returned something other than a response. It may return the response
-                to send.
-            on_overload: ``on_overload(call)``, plain or async, called for a request beyond the
-                backlog. It may return the response to send. ``concurrency`` does not limit it, so
-                it should be quick.
+                an exception, or returned something other than a response or a response that cannot
+                be sent. It may return the response to send. Then the error is only logged at DEBUG.
+            on_overload: ``on_overload(call)``, plain or async, called for a request that the
+                backlog drops. It may return the response to send. ``concurrency`` does not limit
+                it, so it should be quick.
 
         Raises:
             TypeError: the handler is not callable, is a class, or takes neither one argument nor
                 two; a hook is not callable; the type or the QoS does not fit.
-            ValueError: a limit is out of range; the service type does not exist.
+            ValueError: a limit is out of range; there is no such order; the service type does not
+                exist.
             InvalidServiceName: ROS does not allow the name.
             UsageError: this process serves or calls another type under this name.
             SessionClosed, ContextShutdown: the session has ended, or has begun to.
@@ -521,6 +531,7 @@ class Session:
             concurrency=concurrency,
             backlog=backlog,
             backlog_bytes=backlog_bytes,
+            order=order,
             qos=qos,
             on_error=on_error,
             on_overload=on_overload,

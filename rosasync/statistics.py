@@ -112,18 +112,23 @@ class PoolStatistics(KeyStatistics):
 class ServerStatistics:
     """A snapshot of a server's statistics.
 
-    ``running``, ``waiting`` and ``unanswered`` are current. The counts after them are totals.
+    What stands before ``overloads`` is current. That and the counts after it are totals.
 
     Attributes:
         srv_name: the resolved name.
         running: handlers that run now.
         waiting: requests that wait for a handler.
         unanswered: requests taken and neither answered nor given up: running, waiting or deferred.
+        oldest_age: for how many seconds the oldest of the waiting requests has waited.
+        last_age: for how many seconds the request that was served last had waited.
+        overloaded: whether the server is overloaded: requests wait for too long, or are dropped.
+        overloads: how often that has begun.
         taken: requests taken out of the middleware.
         responded: responses sent.
         deferred: handlers that returned without having responded.
         failed: handlers that raised an exception, or returned something other than a response.
-        rejected: requests that arrived when the backlog was full, answered or not.
+        rejected: requests dropped from a full backlog, whether ``on_overload`` answered them or
+            not.
         dropped: calls left unanswered although no handler failed: beyond the backlog,
             garbage-collected, or unanswered when the server ended.
         undeliverable: responses whose client could not be reached, as far as the middleware shows.
@@ -133,6 +138,10 @@ class ServerStatistics:
     running: int = 0
     waiting: int = 0
     unanswered: int = 0
+    oldest_age: float = 0.0
+    last_age: float = 0.0
+    overloaded: bool = False
+    overloads: int = 0
     taken: int = 0
     responded: int = 0
     deferred: int = 0

@@ -51,6 +51,8 @@ async def test_other_bad_arguments(session: Session) -> None:
         session.serve(ECHO, "/bad", echo_call, backlog=-1)
     with pytest.raises(ValueError, match="backlog_bytes"):
         session.serve(ECHO, "/bad", echo_call, backlog_bytes=-1)
+    with pytest.raises(ValueError, match="'fair' or 'arrival', not 'newest'"):
+        session.serve(ECHO, "/bad", echo_call, order="newest")  # type: ignore[call-overload]
     with pytest.raises(TypeError, match="qos"):
         session.serve(ECHO, "/bad", echo_call, qos=10)
     with pytest.raises(InvalidServiceName):
@@ -75,7 +77,8 @@ class TestLimits:
             running -= 1
             return echo_of(request)
 
-        server = session.serve(ECHO, "/served", handler, concurrency=3)
+        # However long it takes on a busy machine.
+        server = session.serve(ECHO, "/served", handler, concurrency=3, order="arrival")
         texts = [f"{n:02}" for n in range(10)]
         tasks = [ask(session, "/served", text) for text in texts]
         await until(lambda: server.statistics().taken == 10)
@@ -102,9 +105,10 @@ class TestLimits:
                 ECHO, name, gate, concurrency=1, backlog=2, on_overload=on_overload
             )
             tasks = [ask(session, name, str(n)) for n in range(5)]
-            assert await asyncio.gather(*tasks[3:]) == ["busy", "busy"]
+            # The oldest of those that waited.
+            assert await asyncio.gather(*tasks[1:3]) == ["busy", "busy"]
             gate.set()
-            assert await asyncio.gather(*tasks[:3]) == ["0", "1", "2"]
+            assert await asyncio.gather(*tasks[:1], *tasks[3:]) == ["0", "3", "4"]
             statistics = server.statistics()
             assert (statistics.rejected, statistics.dropped, statistics.responded) == (2, 0, 5)
 
@@ -124,12 +128,12 @@ class TestLimits:
         await until(lambda: server.statistics().rejected == 4)
         assert server.statistics().dropped == 4
         assert len(caplog.messages) == 1
-        assert "/served: 1 requests wait already" in caplog.text
+        assert "/served: overloaded, with 1 requests waiting" in caplog.text
         gate.set()
-        assert await asyncio.gather(*tasks[:2]) == ["0", "1"]
+        assert [await tasks[0], await tasks[5]] == ["0", "5"]
         await settled(server)
         assert server.statistics().responded == 2
-        await discard(*tasks[2:])
+        await discard(*tasks[1:5])
 
     async def test_beyond_the_backlog_in_bytes(self, session: Session) -> None:
         gate = Gate()
@@ -142,11 +146,11 @@ class TestLimits:
         )
         sizes = [60, 60, 60, 40, 1]
         tasks = [ask(session, "/served", "x" * size) for size in sizes]
-        # The second waits with the fourth; the third and the last do not fit beside them.
-        assert [await task for task in (tasks[2], tasks[4])] == ["busy", "busy"]
+        # The third pushes the second out, and the last the third.
+        assert [await task for task in tasks[1:3]] == ["busy", "busy"]
         assert server.statistics().waiting == 2
         gate.set()
-        assert [len(await task) for task in tasks] == [60, 60, 4, 40, 4]
+        assert [len(await task) for task in tasks] == [60, 4, 4, 40, 1]
         # Of a single request that waits, the size does not matter.
         gate.clear()
         tasks = [ask(session, "/served", "x" * size) for size in (1, 1_000)]

@@ -295,7 +295,7 @@ class TestLastResponses:
     async def test_the_end_waits_until_they_are_received(
         self, session: Session, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("rosasync._server.service_call.DELIVERY_TIME", LIMIT)
+        monkeypatch.setattr("rosasync._server.sending.DELIVERY_TIME", LIMIT)
         server = session.serve(ECHO, "/served", echo_call)
         received = asyncio.Event()
         monkeypatch.setattr(server._port, "delivered", received.is_set)
@@ -309,7 +309,7 @@ class TestLastResponses:
     async def test_the_deadline_ends_the_wait(
         self, session: Session, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("rosasync._server.service_call.DELIVERY_TIME", 10 * LIMIT)
+        monkeypatch.setattr("rosasync._server.sending.DELIVERY_TIME", 10 * LIMIT)
         server = session.serve(ECHO, "/served", echo_call)
         monkeypatch.setattr(server._port, "delivered", lambda: False)
         assert await ask(session, "/served", "text") == "text"
@@ -318,7 +318,7 @@ class TestLastResponses:
     async def test_no_wait_for_old_ones(
         self, session: Session, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("rosasync._server.service_call.DELIVERY_TIME", TICK)
+        monkeypatch.setattr("rosasync._server.sending.DELIVERY_TIME", TICK)
         server = session.serve(ECHO, "/served", echo_call)
         monkeypatch.setattr(server._port, "delivered", lambda: pytest.fail("asked"))
         assert await ask(session, "/served", "text") == "text"
@@ -328,7 +328,7 @@ class TestLastResponses:
     async def test_no_wait_if_no_client_is_left(
         self, session: Session, bridge: Bridge, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("rosasync._server.service_call.DELIVERY_TIME", 10 * LIMIT)
+        monkeypatch.setattr("rosasync._server.sending.DELIVERY_TIME", 10 * LIMIT)
         server = session.serve(ECHO, "/served", echo_call)
         monkeypatch.setattr(server._port, "delivered", lambda: False)
         async with Session("leaving", bridge=bridge) as client:

@@ -260,7 +260,7 @@ class TestDestroyedServices:
         self, fake_graph: FakeGraph, caplog: pytest.LogCaptureFixture
     ) -> None:
         async def handler(call: AnyCall) -> Any:
-            destroy(call.server)
+            destroy(server)
             return echo_of(call.request)
 
         async with fake_graph.session() as session:

@@ -151,7 +151,7 @@ class TestIteration:
             call.respond(echo_of(call.request))
             assert await task == "text"
 
-    async def test_a_call_that_comes_back_after_the_close_is_dropped(
+    async def test_a_call_for_a_cancelled_task_is_dropped_at_the_close(
         self, fake_graph: FakeGraph
     ) -> None:
         async with fake_graph.session() as session:
@@ -159,18 +159,20 @@ class TestIteration:
             victim = asyncio.create_task(anext(server))
             await asyncio.sleep(0)
             served = server._on_request
+            closing: list[asyncio.Task[None]] = []
 
             def deliver(request: Any, header: Any) -> None:
                 served(request, header)
                 victim.cancel()
-                server._stop_taking()
+                closing.append(asyncio.create_task(server.aclose()))
 
             server._port._deliver = deliver  # type: ignore[attr-defined]
             task = ask(session, "/served", "text", timeout=None)
             await asyncio.wait([victim])
+            assert victim.cancelled()
+            await closing[0]
             assert server.statistics().dropped == 1
             assert [call async for call in server] == []
-            await server.aclose()
             assert server.statistics().unanswered == 0
             with pytest.raises(ServerGone):
                 await task

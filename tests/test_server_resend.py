@@ -55,7 +55,7 @@ class TestFaults:
     async def test_one_that_is_never_discovered(
         self, fake_graph: FakeGraph, caplog: pytest.LogCaptureFixture, monkeypatch: Any
     ) -> None:
-        monkeypatch.setattr("rosasync._server.service_call.RESEND", (0.0, TICK))
+        monkeypatch.setattr("rosasync._server.resending.RESEND", (0.0, TICK))
         async with fake_graph.session() as session:
             holder = Holder()
             server = session.serve(ECHO, "/held", holder)
@@ -146,7 +146,7 @@ class TestFaults:
     async def test_no_more_than_the_limit_wait(
         self, fake_graph: FakeGraph, caplog: pytest.LogCaptureFixture, monkeypatch: Any
     ) -> None:
-        monkeypatch.setattr("rosasync._server.service_call.MAX_UNSENT", 5)
+        monkeypatch.setattr("rosasync._server.resending.MAX_UNSENT", 5)
         async with fake_graph.session() as session:
             holder = Holder()
             server = session.serve(ECHO, "/held", holder)

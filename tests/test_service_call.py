@@ -110,7 +110,7 @@ class TestCall:
         (statistics,) = session.statistics().servers
         assert statistics.responded == 1
 
-    @pytest.mark.parametrize("wrong", [None, "text", {"message": "text"}, SetBool.Response()])
+    @pytest.mark.parametrize("wrong", [None, "text", [("message", "text")], SetBool.Response()])
     async def test_of_the_wrong_type(self, session: Session, holder: Holder, wrong: Any) -> None:
         task = ask(session, "/held", "text")
         (call,) = await holder.held(1)

@@ -20,7 +20,7 @@ from rosasync._ros.responder import (
     Responder,
     client_of,
 )
-from rosasync._server.service_call import RESEND
+from rosasync._server.resending import RESEND
 from rosasync.errors import ContextShutdown
 from tests.support.times import LIMIT, TICK
 

@@ -19,7 +19,7 @@ from rosasync.typing import FeedbackT, GoalT, ResultT
 
 if TYPE_CHECKING:
     from rosasync._actions.server_goals import ServerGoals
-    from rosasync._server.handlers import HandlerTasks
+    from rosasync._server.handler_tasks import HandlerTasks
 
 __all__ = ["GoalErrorHook", "GoalHandler", "GoalRunner", "OnBusy", "check_handler", "check_on_busy"]
 

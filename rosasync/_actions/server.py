@@ -24,7 +24,8 @@ from rosasync._actions.server_goal import ServerGoal
 from rosasync._actions.server_goals import ServerGoals
 from rosasync._core.aio import until_done
 from rosasync._core.ports import PortDestroyed, TopicQos
-from rosasync._server.handlers import HandlerTasks, check_hook
+from rosasync._server.handler_tasks import HandlerTasks
+from rosasync._server.handlers import check_hook
 from rosasync.errors import ContextShutdown, SessionClosed, UsageError
 from rosasync.options import check_count, check_seconds, check_timeout
 from rosasync.statistics import ActionServerStatistics

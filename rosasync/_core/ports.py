@@ -158,6 +158,9 @@ class ServicePort(Protocol):
     def destroyed(self) -> bool:
         """Whether something other than rosasync has destroyed the service."""
 
+    def client_of(self, header: RequestHeader) -> Hashable:
+        """Return the identity of the client that sent a request; None if it is unknown."""
+
     def send(self, header: RequestHeader, response: Any) -> None:
         """Convert and send a response. From any thread, but not during or after `close`.
 
@@ -167,6 +170,7 @@ class ServicePort(Protocol):
             PortDestroyed: the service was destroyed.
             TypeError, ValueError: a field has a value that cannot be sent; the message names its
                 path.
+            RosasyncError: the middleware refuses the response.
         """
 
     def has_clients(self) -> bool:

@@ -16,7 +16,7 @@ from rosasync._core.ports import Deliver, DeliverMessage, DeliverRequest
 from rosasync._ros.busy_poll import BusyPoll
 from rosasync._ros.failures import RclpyError, check_up, explain, is_destroyed
 from rosasync._ros.rcl import Rcl
-from rosasync._ros.responder import Responder
+from rosasync._ros.responder import Responder, client_of
 from rosasync._ros.services import make_service, qos_of, take_requests
 from rosasync._ros.signals import Signal, Signals
 from rosasync._ros.topics import DirectSubscription, take_messages
@@ -347,6 +347,7 @@ class DirectService:
         self._take = self._service.service_take_request
         self._responder = Responder(node, service, self.qos)
         self.send = self._responder.send
+        self.client_of = client_of
         self.has_clients = self._responder.has_clients
         self.delivered = self._responder.delivered
         self._closed = False

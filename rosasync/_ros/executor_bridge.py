@@ -15,7 +15,7 @@ from rclpy.node import Node
 from rosasync._core.gateway import LoopGateway
 from rosasync._core.ports import Deliver, DeliverMessage, DeliverRequest, RequestHeader
 from rosasync._ros.failures import RclpyError, explain, is_destroyed
-from rosasync._ros.responder import Responder
+from rosasync._ros.responder import Responder, client_of
 from rosasync._ros.services import make_service, qos_of, take_request
 from rosasync._ros.topics import ExecutorSubscription
 from rosasync.errors import RosasyncError, SessionClosed
@@ -219,6 +219,7 @@ class ExecutorService:
         self._take = self._service.service_take_request
         self._responder = Responder(node, service, self.qos)
         self.send: Callable[[RequestHeader, Any], None] = self._responder.send
+        self.client_of = client_of
         self.has_clients = self._responder.has_clients
         self.delivered = self._responder.delivered
         service.send_response = self._taken

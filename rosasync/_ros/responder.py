@@ -27,6 +27,7 @@ from rosasync._ros.endpoints import (
 from rosasync._ros.failures import RclpyError, explain, is_destroyed, uses_node
 from rosasync._ros.fastdds import acknowledged
 from rosasync._ros.messages import make_message
+from rosasync.errors import RosasyncError
 
 __all__ = ["Responder", "client_of"]
 
@@ -139,6 +140,7 @@ class Responder:
             PortDestroyed: the service was destroyed.
             ContextShutdown: the node is down.
             TypeError, ValueError: a field has a value that cannot be sent.
+            RosasyncError: the middleware refuses the response.
         """
         if not self._fits(response):
             response = make_message(self._response_type, response)
@@ -193,7 +195,8 @@ class Responder:
     def _failure(self, error: Exception) -> Exception:
         if is_destroyed(self._handle):
             return explain(self._node, self._handle, error)
-        return Undeliverable(str(error))
+        # Not `Undeliverable`: it is the response that is at fault, not its client.
+        return RosasyncError(f"the middleware refuses the response: {error}")
 
     def _check_visible(self, header: RequestHeader) -> None:
         """Raise if the graph does not show the client: the middleware dropped the response."""

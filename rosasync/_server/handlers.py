@@ -1,4 +1,4 @@
-"""The handlers of a server: their kinds, how they and the hooks run, and their tasks."""
+"""The handlers of a server: their kinds, and how they and the hooks run."""
 
 from __future__ import annotations
 
@@ -6,130 +6,56 @@ import asyncio
 import functools
 import inspect
 import logging
-from collections.abc import Awaitable, Callable, Coroutine
-from contextvars import Context, ContextVar
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
+from contextvars import Context
 from dataclasses import dataclass
 from time import monotonic
 from typing import Any, Generic, TypeAlias, TypeVar
 
 from rosasync._server.blocking import BLOCKING, BlockingReport
-from rosasync._server.service_call import CallCounts, ResponseSender, ServiceCall
+from rosasync._server.counts import CallCounts
+from rosasync._server.handler_tasks import HandlerTasks
+from rosasync._server.sending import ResponseSender
+from rosasync._server.service_call import ServiceCall
 from rosasync.errors import ContextShutdown, SessionClosed
 from rosasync.typing import RequestT, ResponseT
 
 __all__ = [
+    "Answer",
     "ErrorHook",
     "Handler",
     "HandlerKind",
     "HandlerRunner",
-    "HandlerTasks",
     "OverloadHook",
     "check_hook",
     "settle_kind",
 ]
 
+Answer: TypeAlias = ResponseT | Mapping[str, Any]
+"""A response, or a mapping of its fields."""
+
 Handler: TypeAlias = (
-    Callable[[RequestT, ResponseT], ResponseT | Awaitable[ResponseT]]
+    Callable[[RequestT, ResponseT], Answer[ResponseT] | Awaitable[Answer[ResponseT]]]
     | Callable[
         [ServiceCall[RequestT, ResponseT]],
-        ResponseT | Awaitable[ResponseT | None] | None,
+        Answer[ResponseT] | Awaitable[Answer[ResponseT] | None] | None,
     ]
 )
 """``handler(request, response)`` or ``handler(call)``, plain or async."""
 
 ErrorHook: TypeAlias = Callable[
     [ServiceCall[RequestT, ResponseT], Exception],
-    ResponseT | Awaitable[ResponseT | None] | None,
+    Answer[ResponseT] | Awaitable[Answer[ResponseT] | None] | None,
 ]
 """``on_error(call, error)``, plain or async."""
 
 OverloadHook: TypeAlias = Callable[
     [ServiceCall[RequestT, ResponseT]],
-    ResponseT | Awaitable[ResponseT | None] | None,
+    Answer[ResponseT] | Awaitable[Answer[ResponseT] | None] | None,
 ]
 """``on_overload(call)``, plain or async."""
 
 logger = logging.getLogger("rosasync")
-
-_handler_task: ContextVar[asyncio.Task[Any] | None] = ContextVar("handler_task", default=None)
-"""The task of the handler, or hook, in whose context the code runs. Tasks that a handler starts
-inherit it."""
-
-
-class HandlerTasks:
-    """The tasks of a server's handlers, which its end waits for. Confined to the loop's thread.
-
-    A handler that waits for the end itself, by closing its server or its session, is neither waited
-    for nor cancelled: it would deadlock.
-    """
-
-    def __init__(self) -> None:
-        self._loop = asyncio.get_running_loop()
-        self._tasks: set[asyncio.Task[None]] = set()
-        self._closers: set[asyncio.Task[Any]] = set()
-        # Wakes `wait` when `_closers` grows, because it must not wait for a closer.
-        self._closer_added: asyncio.Future[None] | None = None
-
-    def __len__(self) -> int:
-        return len(self._pending())
-
-    def spawn(self, work: Coroutine[Any, Any, None], context: Context | None = None) -> None:
-        """Run a coroutine in a task, in a copy of this context, or of the current one."""
-        # Not with the argument `context`, because not every task factory takes it.
-        create = self._loop.create_task
-        task = create(self._run(work)) if context is None else context.run(create, self._run(work))
-        if not task.done():
-            self._tasks.add(task)
-
-    def exclude_caller(self) -> None:
-        """Do not wait for the handler whose task calls this, or started the task that does."""
-        task = _handler_task.get()
-        if task in self._tasks:
-            self._closers.add(task)
-            if self._closer_added is not None and not self._closer_added.done():
-                self._closer_added.set_result(None)
-
-    async def wait(self, deadline: float | None) -> None:
-        """Wait until every task is done, or until ``deadline`` in loop time (None: no deadline)."""
-        while tasks := self._pending():
-            left = None if deadline is None else deadline - self._loop.time()
-            if left is not None and left <= 0:
-                return
-            self._closer_added = self._loop.create_future()
-            await asyncio.wait(
-                {*tasks, self._closer_added},
-                timeout=left,
-                return_when=asyncio.FIRST_COMPLETED,
-            )
-
-    def cancel(self) -> None:
-        """Cancel every task, in the next turn."""
-        for task in self._pending():
-            # Not at once: a task that has not begun would end without running its handler's
-            # `finally`, or ours.
-            self._loop.call_soon(task.cancel)
-
-    def _pending(self) -> set[asyncio.Task[None]]:
-        # A task that other code cancels before it begins never removes itself from the set.
-        return {task for task in self._tasks - self._closers if not task.done()}
-
-    async def _run(self, work: Coroutine[Any, Any, None]) -> None:
-        task = asyncio.current_task()
-        assert task is not None
-        # `spawn` is too late for this if the task starts eagerly.
-        self._tasks.add(task)
-        _handler_task.set(task)
-        try:
-            await work
-        except (KeyboardInterrupt, SystemExit):
-            # The loop raises it. Retrieve it, so that the task does not log it as well.
-            task.add_done_callback(asyncio.Task.exception)
-            raise
-        finally:
-            # Otherwise the task and its context keep each other alive.
-            _handler_task.set(None)
-            self._tasks.discard(task)
-            self._closers.discard(task)
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,7 +124,11 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
                 self._finish(call, result)
             else:
                 in_task = True
-                self._tasks.spawn(self._await_handler(call, self._blocking.timed(result)), context)
+                self._tasks.spawn(
+                    self._await_handler(call, self._blocking.timed(result)),
+                    lambda: self._never_ran(call, result),
+                    context,
+                )
         except BaseException as error:
             self._contain(call, error, self._fail)
         finally:
@@ -211,6 +141,7 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
         hook: Callable[..., Any],
         arguments: tuple[Any, ...],
         otherwise: Callable[[ServiceCall[RequestT, ResponseT]], None],
+        answered: Callable[[ServiceCall[RequestT, ResponseT]], None] = lambda call: None,
     ) -> None:
         """Send the response that a hook returns, plain or async.
 
@@ -218,19 +149,22 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
             call: the call to answer.
             hook: the hook.
             arguments: what it is called with.
-            otherwise: called with the call if the hook has failed or returned None.
+            otherwise: called with the call if it is not answered then.
+            answered: called with the call if it is.
         """
         try:
             result = hook(*arguments)
             if result is not None and inspect.isawaitable(result):
-                self._tasks.spawn(self._await_hook(call, result, otherwise))
+                self._tasks.spawn(
+                    self._await_hook(call, result, otherwise, answered),
+                    lambda: self._hook_never_ran(call, result, otherwise),
+                )
                 return
             if result is not None:
                 call.respond(result)
         except BaseException as error:
             self._contain(call, error, self._fail_hook)
-        if not call.settled:
-            otherwise(call)
+        (answered if call.responded else otherwise)(call)
 
     def _invoke(self, call: ServiceCall[RequestT, ResponseT], context: Context | None) -> Any:
         """Call the handler, in a context if there is one, and report it if it blocks the loop."""
@@ -243,8 +177,33 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
             if monotonic() - began > BLOCKING:
                 self._blocking.report(monotonic() - began)
 
-    def _cancelled(self, call: ServiceCall[RequestT, ResponseT]) -> None:
-        """Give up a call whose handler, or hook, was cancelled."""
+    def _never_ran(self, call: ServiceCall[RequestT, ResponseT], pending: Awaitable[Any]) -> None:
+        """Settle a call whose handler's task was cancelled before it began."""
+        self.running -= 1
+        self._cancelled(call, pending)
+        self._on_finished()
+
+    def _hook_never_ran(
+        self,
+        call: ServiceCall[RequestT, ResponseT],
+        pending: Awaitable[Any],
+        otherwise: Callable[[ServiceCall[RequestT, ResponseT]], None],
+    ) -> None:
+        self._cancelled(call, pending)
+        otherwise(call)
+
+    def _cancelled(
+        self, call: ServiceCall[RequestT, ResponseT], pending: Awaitable[Any] | None = None
+    ) -> None:
+        """Give up a call whose handler, or hook, was cancelled.
+
+        Args:
+            call: the call.
+            pending: what the handler, or hook, has returned, if it has not been awaited.
+        """
+        if isinstance(pending, Coroutine):
+            # Otherwise Python warns that it was never awaited.
+            pending.close()
         call.give_up("given up: its handler was cancelled")
         if not call.responded:
             logger.warning(
@@ -269,6 +228,7 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
         call: ServiceCall[RequestT, ResponseT],
         pending: Awaitable[Any],
         otherwise: Callable[[ServiceCall[RequestT, ResponseT]], None],
+        answered: Callable[[ServiceCall[RequestT, ResponseT]], None],
     ) -> None:
         try:
             result = await pending
@@ -276,8 +236,7 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
                 call.respond(result)
         except BaseException as error:
             self._contain(call, error, self._fail_hook)
-        if not call.settled:
-            otherwise(call)
+        (answered if call.responded else otherwise)(call)
 
     def _finish(self, call: ServiceCall[RequestT, ResponseT], result: Any) -> None:
         assert self._kind is not None
@@ -318,19 +277,35 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
             )
             return
         self._counts.failed += 1
+        if self._on_error is None or call.settled:
+            self._give_up_failed(error, call)
+        else:
+            self.call_hook(
+                call,
+                self._on_error,
+                (call, error),
+                functools.partial(self._give_up_failed, error),
+                functools.partial(self._log_answered, error),
+            )
+
+    def _log_answered(self, error: Exception, call: ServiceCall[RequestT, ResponseT]) -> None:
+        """Log the error of a handler for which `on_error` has answered."""
+        logger.debug(
+            "%s: the handler of %r raised an exception, and on_error has answered",
+            self._sender.name,
+            call,
+            exc_info=error,
+        )
+
+    def _give_up_failed(self, error: Exception, call: ServiceCall[RequestT, ResponseT]) -> None:
+        """Log the error of a handler, and leave its call unanswered unless it is settled."""
         logger.error(
             "%s: the handler of %r raised an exception%s",
             self._sender.name,
             call,
-            "" if self._on_error or call.settled else ", so its client gets no response",
+            "" if call.settled else ", so its client gets no response",
             exc_info=error,
         )
-        if self._on_error is None or call.settled:
-            self._give_up(call)
-        else:
-            self.call_hook(call, self._on_error, (call, error), self._give_up)
-
-    def _give_up(self, call: ServiceCall[RequestT, ResponseT]) -> None:
         call.give_up("given up: its handler failed", failed=True)
 
     def _fail_hook(self, call: ServiceCall[RequestT, ResponseT], error: Exception) -> None:

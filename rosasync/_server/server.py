@@ -1,38 +1,32 @@
-"""ServiceServer: takes requests, limits how many run and wait, and ends."""
+"""ServiceServer: takes requests, runs handlers for as many as it may, and ends."""
 
 from __future__ import annotations
 
 import asyncio
-import bisect
 import functools
-import itertools
 import logging
 import math
-from collections import deque
 from collections.abc import Callable
-from contextlib import suppress
 from time import monotonic_ns
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Generic, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Generic, Literal, Self
 
 from rosasync._core.aio import until_done
+from rosasync._server.backlog import Backlog
+from rosasync._server.counts import CallCounts
+from rosasync._server.handler_tasks import HandlerTasks
 from rosasync._server.handlers import (
     ErrorHook,
     Handler,
     HandlerRunner,
-    HandlerTasks,
     OverloadHook,
     check_hook,
     settle_kind,
 )
-from rosasync._server.service_call import (
-    CallCounts,
-    RequestInfo,
-    ResponseSender,
-    ServiceCall,
-    service_destroyed,
-)
-from rosasync._server.sizes import payload_size
+from rosasync._server.intake import Intake
+from rosasync._server.overload import OverloadLog
+from rosasync._server.sending import ResponseSender, service_destroyed
+from rosasync._server.service_call import RequestInfo, ServiceCall
 from rosasync.errors import SessionClosed, UsageError
 from rosasync.options import check_count, check_timeout
 from rosasync.statistics import ServerStatistics
@@ -43,9 +37,12 @@ if TYPE_CHECKING:
     from rosasync._core.ports import NodePort, RequestHeader
     from rosasync.tracing import Tracing
 
-__all__ = ["Handler", "RequestInfo", "ServiceCall", "ServiceServer"]
+__all__ = ["Handler", "Order", "RequestInfo", "ServiceCall", "ServiceServer"]
 
 logger = logging.getLogger("rosasync")
+
+Order = Literal["fair", "arrival"]
+"""The order of the requests that wait while a server is overloaded."""
 
 CLOSE_TIMEOUT = 5.0
 """Seconds to wait for handlers to finish when a server is closed."""
@@ -60,9 +57,9 @@ class ServiceServer(Generic[RequestT, ResponseT]):
     of the block. If it has no handler, ``async for call in server:`` gives the calls.
 
     At most ``concurrency`` handlers run at a time. Up to ``backlog`` requests, of ``backlog_bytes``
-    in total, wait their turn in the order of their arrival. They wait in Python, because the queue
-    of the middleware would overflow. A plain handler runs in the loop, and blocks it until it
-    returns. An async one runs in a task.
+    in total, wait their turn. They wait in Python, because the queue of the middleware would
+    overflow. `Backlog` decides whose turn it is, and what is dropped if more come. A plain handler
+    runs in the loop, and blocks it until it returns. An async one runs in a task.
 
     Confined to the loop's thread, except `ServiceCall.respond`: responses are sent from any thread,
     several at once, and the service is destroyed only when none is being sent. rcl does not allow
@@ -80,6 +77,7 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         concurrency: int,
         backlog: int,
         backlog_bytes: int,
+        order: Order,
         qos: Any,
         on_error: ErrorHook[RequestT, ResponseT] | None,
         on_overload: OverloadHook[RequestT, ResponseT] | None,
@@ -93,9 +91,11 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         self._on_end = on_end
         self._concurrency = check_count("concurrency", concurrency, 1)
         self._has_handler = kind is not None
-        self._queue = _CallQueue[RequestT, ResponseT](
-            check_count("backlog", backlog, 0), check_count("backlog_bytes", backlog_bytes, 0)
+        limits = (
+            check_count("backlog", backlog, 0),
+            check_count("backlog_bytes", backlog_bytes, 0),
         )
+        by_arrival = _check_order(order) == "arrival"
         self._counts = CallCounts()
         self._tasks = HandlerTasks()
         self._taking = True
@@ -103,18 +103,20 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         self._end_task: asyncio.Task[None] | None = None
         # Whether `_start_waiting` is active, so that it is not entered again.
         self._starting = False
-        # Whether the warning about dropped requests was logged since the backlog last shrank.
-        self._overload_logged = False
         service = node.describe(srv_type, srv_name, qos)
         self._name, self._type_name, _ = service.key
         self._tracing = tracing
         self._traces = ServerTracing(tracing, service.key)
         self._port = node.open_service(service, self._on_request)
         self._qos = self._port.qos
+        self._backlog = Backlog[ServiceCall[RequestT, ResponseT]](*limits, by_arrival=by_arrival)
+        self._overload = OverloadLog(self._name, by_arrival)
+        self._intake = Intake(self._backlog, self._overload, self._drop)
         self._sender = ResponseSender[ResponseT](
             self._name,
             self._type_name,
             service.srv_type.Response,
+            functools.partial(node.make_message, service.srv_type.Response),
             self._port,
             self._counts,
             self._tasks.spawn,
@@ -125,7 +127,7 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         )
 
     def __repr__(self) -> str:
-        counts = f"{self._runner.running} running, {len(self._queue)} waiting"
+        counts = f"{self._runner.running} running, {len(self._intake)} waiting"
         state = "closed" if self.closed else counts
         return f"<ServiceServer {self._name} [{self._type_name}] {state}>"
 
@@ -154,8 +156,7 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         if self._has_handler:
             raise UsageError(f"{self._name}: a server with a handler cannot be iterated over")
         self._check_loop("iterated over")
-        call = await self._queue.get()
-        self._overload_logged = False
+        call = await self._intake.get()
         if call is not None:
             if call.trace is not None:
                 call.trace.enter("handling")
@@ -206,7 +207,11 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         return ServerStatistics(
             srv_name=self._name,
             running=self._runner.running,
-            waiting=len(self._queue),
+            waiting=len(self._intake),
+            oldest_age=self._intake.oldest_age,
+            last_age=self._backlog.last_age,
+            overloaded=self._overload.active,
+            overloads=self._overload.times,
             unanswered=counts.unanswered,
             taken=counts.taken,
             responded=counts.responded,
@@ -269,6 +274,7 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         try:
             self._stop_taking()
             self._drop_waiting()
+            self._overload.close()
             self._sender.close(ending)
             self._traces.close()
             self._port.close()
@@ -289,15 +295,14 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         now = monotonic_ns()
         trace = self._traces.start(now) if now >= self._tracing.quiet_until else None
         call = ServiceCall(self, request, header, self._sender, now, trace)
-        if self._has_handler and not self._queue and self._runner.running < self._concurrency:
+        if self._has_handler and not self._intake and self._runner.running < self._concurrency:
+            # It has not waited.
+            self._backlog.last_age = 0.0
             self._runner.start(call)
-        elif self._queue.put(call):
-            if trace is not None:
-                trace.enter("queued")
+        else:
+            self._intake.put(call, self._port.client_of(header))
             if self._has_handler:
                 self._start_waiting()
-        else:
-            self._overload(call)
 
     def _start_waiting(self) -> None:
         # An eager task (Python 3.12) may finish its handler inside `start`, which calls this again.
@@ -306,29 +311,21 @@ class ServiceServer(Generic[RequestT, ResponseT]):
             return
         self._starting = True
         try:
-            while self._queue and self._runner.running < self._concurrency:
-                self._overload_logged = False
-                self._runner.start(self._queue.pop())
+            while self._intake and self._runner.running < self._concurrency:
+                self._runner.start(self._intake.pop())
         finally:
             self._starting = False
 
-    def _overload(self, call: ServiceCall[RequestT, ResponseT]) -> None:
+    def _drop(self, call: ServiceCall[RequestT, ResponseT]) -> None:
+        """Settle a call for which the backlog has no room."""
         self._counts.rejected += 1
         if self._on_overload is None:
-            self._drop_overload(call)
+            self._give_up_dropped(call)
         else:
-            self._runner.call_hook(call, self._on_overload, (call,), self._drop_overload)
+            self._runner.call_hook(call, self._on_overload, (call,), self._give_up_dropped)
 
-    def _drop_overload(self, call: ServiceCall[RequestT, ResponseT]) -> None:
-        if call.give_up("dropped: too many requests were waiting") and not self._overload_logged:
-            self._overload_logged = True
-            logger.warning(
-                "%s: %d requests wait already, so further ones are dropped unanswered (%d so far): "
-                "raise concurrency or backlog, or answer them with on_overload",
-                self._name,
-                len(self._queue),
-                self._counts.dropped,
-            )
+    def _give_up_dropped(self, call: ServiceCall[RequestT, ResponseT]) -> None:
+        call.give_up("dropped: too many requests were waiting")
 
     # Ending.
 
@@ -345,17 +342,18 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         self._taking = False
         self._port.stop()
         if not self._has_handler:
-            self._queue.close()
+            self._intake.close()
 
     def _drop_waiting(self) -> None:
-        if self._queue:
+        waiting = self._intake.clear()
+        if waiting:
             logger.warning(
                 "%s: closed with %d requests waiting, which are dropped unanswered",
                 self._name,
-                len(self._queue),
+                len(waiting),
             )
-            while self._queue:
-                self._queue.pop().give_up("dropped: the server was closed")
+        for call in waiting:
+            call.give_up("dropped: the server was closed")
 
     async def _end(self, timeout: float | None) -> None:
         deadline = None if timeout is None else self._loop.time() + timeout
@@ -380,115 +378,7 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         self.end(functools.partial(SessionClosed, f"{self._name}: the server is closed"))
 
 
-class _Waiting(NamedTuple):
-    """A call that waits.
-
-    Attributes:
-        number: its place in the order of arrival.
-        size: the estimated number of bytes of its request.
-        call: the call.
-    """
-
-    number: int
-    size: int
-    call: ServiceCall[Any, Any]
-
-
-class _CallQueue(Generic[RequestT, ResponseT]):
-    """Calls that wait for a handler or an iterator, and iterators that wait for calls.
-
-    At most one of the two kinds waits at a time. Confined to the loop's thread.
-
-    Args:
-        limit: the maximum number of calls that wait.
-        limit_bytes: the maximum size of their requests together, unless only one call waits.
-    """
-
-    def __init__(self, limit: int, limit_bytes: int) -> None:
-        self._loop = asyncio.get_running_loop()
-        self._limit = limit
-        self._limit_bytes = limit_bytes
-        self._bytes = 0
-        self._numbers = itertools.count()
-        self._closed = False
-        # In the order of arrival, in which `_put_back` finds a place.
-        self._calls: deque[_Waiting] = deque()
-        # Each is completed with an entry of `_calls`, or with None when the queue is closed.
-        self._getters: deque[asyncio.Future[_Waiting | None]] = deque()
-
-    def __len__(self) -> int:
-        return len(self._calls)
-
-    def put(self, call: ServiceCall[RequestT, ResponseT]) -> bool:
-        """Pass a call to the iterator that waits longest, or keep it.
-
-        Returns:
-            False if the queue is full.
-        """
-        number = next(self._numbers)
-        if self._getters and self._hand_out(_Waiting(number, 0, call)):
-            return True
-        waiting = len(self._calls)
-        if waiting >= self._limit:
-            return False
-        size = payload_size(call.request)
-        if waiting and self._bytes + size > self._limit_bytes:
-            return False
-        self._bytes += size
-        self._calls.append(_Waiting(number, size, call))
-        return True
-
-    def pop(self) -> ServiceCall[RequestT, ResponseT]:
-        """Return the call that waits longest."""
-        waiting = self._calls.popleft()
-        self._bytes -= waiting.size
-        return waiting.call
-
-    async def get(self) -> ServiceCall[RequestT, ResponseT] | None:
-        """Wait for a call; None if the queue is closed."""
-        if self._calls:
-            return self.pop()
-        if self._closed:
-            return None
-        getter: asyncio.Future[_Waiting | None] = self._loop.create_future()
-        self._getters.append(getter)
-        try:
-            entry = await getter
-        except BaseException:
-            # The task was cancelled, or its coroutine closed. The getter may still be queued, may
-            # have been removed by `_hand_out`, or may have received a call just before.
-            if not getter.done():
-                getter.cancel()
-            if getter.cancelled():
-                with suppress(ValueError):
-                    self._getters.remove(getter)
-            elif (entry := getter.result()) is not None:
-                self._put_back(entry)
-            raise
-        return None if entry is None else entry.call
-
-    def close(self) -> None:
-        """End the iterators once no call is left; idempotent."""
-        self._closed = True
-        while self._getters:
-            getter = self._getters.popleft()
-            if not getter.done() and not self._loop.is_closed():
-                getter.set_result(None)
-
-    def _hand_out(self, entry: _Waiting) -> bool:
-        while self._getters:
-            getter = self._getters.popleft()
-            if not getter.done():
-                getter.set_result(entry)
-                return True
-        return False
-
-    def _put_back(self, entry: _Waiting) -> None:
-        """Pass a call to the next iterator, or put it back in its place, even beyond the limits."""
-        if self._closed:
-            entry.call.give_up("dropped: the server was closed")
-        elif not self._hand_out(entry):
-            size = payload_size(entry.call.request)
-            self._bytes += size
-            place = bisect.bisect(self._calls, entry.number, key=lambda waiting: waiting.number)
-            self._calls.insert(place, entry._replace(size=size))
+def _check_order(order: Order) -> Order:
+    if order not in ("fair", "arrival"):
+        raise ValueError(f"order must be 'fair' or 'arrival', not {order!r}")
+    return order

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, field
@@ -123,6 +123,10 @@ class FaultyService:
     def destroyed(self) -> bool:
         """Whether something other than rosasync has destroyed the service."""
         return self._port.destroyed
+
+    def client_of(self, header: RequestHeader) -> Hashable:
+        """Return the identity of the client that sent a request."""
+        return self._port.client_of(header)
 
     def send(self, header: RequestHeader, response: Any) -> None:
         """Send a response as the faults say. From any thread."""

@@ -150,6 +150,10 @@ class FakeService(FakeServer):
         self._stopped = False
         self._loop = asyncio.get_running_loop()
 
+    def client_of(self, header: Any) -> Hashable:
+        """Return the client that sent a request."""
+        return header.client  # type: ignore[no-any-return]
+
     def send(self, header: Any, response: Any) -> None:
         """Send a copy of a response. From any thread.
 
