@@ -13,7 +13,7 @@ import typer
 from matplotlib.figure import Figure
 from rich.progress import Progress
 
-from benchmarks import cold, faults, sharing
+from benchmarks import cold, crash, faults, sharing
 from benchmarks.hosts import NoHosts
 from benchmarks.pages import replace_section
 from benchmarks.tables import make_console, make_table
@@ -84,9 +84,16 @@ def fail(
 def start(
     programs: Annotated[str, typer.Option(help="These programs.")] = ",".join(cold.PROGRAMS),
     processes: Annotated[int, typer.Option(min=1, help="Processes of each program.")] = 50,
+    after_crash: Annotated[
+        bool, typer.Option("--after-crash", help="Kill and replace clients, and servers, instead.")
+    ] = False,
+    before: Before = None,
     json: Json = None,
 ) -> None:
     """From the start of a process to its first answer."""
+    if after_crash:
+        replace(processes, before, json)
+        return
     with checked():
         chosen = cold.check_programs(split(programs))
     isolate()
@@ -95,6 +102,17 @@ def start(
     with collected(trials, None, None, total, json) as add:
         starts = cold.measure(chosen, processes, add)
     make_console().print(make_table("", cold.heading, cold.rows(starts)))
+
+
+def replace(restarts: int, before: Path | None, json: Path | None) -> None:
+    """Measure processes that replace killed ones."""
+    chosen = crash.check_contestants(crash.CONTESTANTS, before)
+    isolate()
+    trials = Trials(crash.COMMAND, {"restarts": restarts})
+    total = 2 * restarts * len(chosen)
+    with collected(trials, None, None, total, json) as add:
+        found = crash.measure(chosen, restarts, before, add)
+    make_console().print(make_table("", crash.heading, crash.rows(found)))
 
 
 def publish(
@@ -114,6 +132,8 @@ def section(trials: Trials, out: Path) -> str:
     """Return the section of these trials, after drawing its plot."""
     if trials.command == faults.COMMAND:
         return faults.section(trials)
+    if trials.command == crash.COMMAND:
+        return crash.section(trials)
     picture = f"benchmarks/{trials.command}.svg"
     if trials.command == sharing.COMMAND:
         save(sharing.draw(trials), out / picture)

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks import cold, commands, faults, hosts, pages, profile, sharing
+from benchmarks import cold, commands, crash, faults, hosts, pages, profile, sharing
 from benchmarks.contestants import CONTESTANTS, make_contestant
 from benchmarks.contestants.base import LoggedCall
 from benchmarks.meter import Usage
@@ -236,8 +236,9 @@ def test_trials_are_published_between_their_marks(tmp_path: Path) -> None:
         ("sharing", [cell("direct", [5]), cell("direct", [5, 4])]),
         ("faults", [faults.Fault(faults.SLOW, "direct", 8, 1.0, {"answered": 24}, plain_lost=0)]),
         ("cold", starts),
+        ("crash", [crash.Restart("client", "stock", 2.5), crash.Restart("client", "stock", None)]),
     ]
-    files = []
+    files: list[Path] = []
     for command, rows_of in kinds:
         trials = Trials(command, {"callers": 16, "seconds": 1.0, "processes": 2}, machine)
         trials.rows = [dataclasses.asdict(row) for row in rows_of]
@@ -254,8 +255,9 @@ def test_trials_are_published_between_their_marks(tmp_path: Path) -> None:
     assert "| rosasync script | 2 | 0.50 | 0.50 | 0.50 | 1 |" in text
     assert "| rosasync | 2 | 1 | 0 | 0.00 | 9.00 | 4 | 0.99 | 1.00 | 2.00 |  |" in text
     written = {path.name for path in (tmp_path / "benchmarks").iterdir()}
+    assert "| stock | client | 2 | 2.50 | 2.50 | 1 | 1 |" in text
     assert written == {"sharing.svg", "cold.svg"}
-    assert len(pages.marked_sections(text)) == 3
+    assert len(pages.marked_sections(text)) == 4
     page.write_text("{}")
     with pytest.raises(ValueError, match="not the trials"):
         Trials.load([page])

@@ -12,6 +12,7 @@ from concurrent.futures import CancelledError, Future, InvalidStateError
 from copy import deepcopy
 from typing import TYPE_CHECKING, Any, overload
 
+from rosasync._core.fork import check_fork
 from rosasync.errors import ResponseTimeout, SessionClosed, UsageError
 from rosasync.typing import RequestT, ResponseT, ServiceType, Timeout
 
@@ -199,6 +200,7 @@ class Portal:
         )
 
     def _check_loop(self, instead: str) -> None:
+        check_fork()
         self._gateway.check_open()
         if self._gateway.on_thread or self._gateway.on_loop:
             raise UsageError(

@@ -18,6 +18,7 @@ from rclpy.serialization import deserialize_message
 from rclpy.service_introspection import ServiceIntrospectionState
 from rclpy.signals import SignalHandlerOptions
 
+from rosasync._core.fork import check_fork, forked, note_use, refuse
 from rosasync._core.gateway import LoopGateway
 from rosasync._core.ports import (
     Action,
@@ -114,6 +115,7 @@ class RosNode:
         self._waitable: GraphWaitable | None = None
         self._bridge: Bridge | None = None
         self._publishers: dict[Publisher, None] = {}
+        check_fork()
         try:
             self._open(options)
         except BaseException:
@@ -288,6 +290,7 @@ class RosNode:
 
     def _open(self, options: SessionOptions) -> None:
         self._node = self._make_node(options)
+        note_use()
         check_up(self._node)
         self._name = str(self._node.get_name())
         executor = options.executor
@@ -340,6 +343,9 @@ class RosNode:
             return Node(name, context=context)
         domain = context.get_domain_id()
         check_domain(domain)
+        if forked() and discovery.own_ports(domain):
+            # Inherited from a stock node of the parent.
+            raise refuse()
         if given is not None:
             if not discovery.own_ports(domain):
                 check_ports(domain)
