@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Hashable
 from typing import Any, Literal
 
 import pytest
@@ -15,6 +15,7 @@ from rosasync._actions.status import read_statuses, uuid_bytes
 from rosasync._core.gateway import LoopGateway
 from rosasync._core.ports import ClientPort, NodePort, TopicQos
 from rosasync._ros.node import RosNode
+from rosasync._status.wire import process_of
 from rosasync.options import Limits, SessionOptions
 from rosasync.testing import FakeGraph, FakeNode
 from tests.support.echo import ECHO, answer_to, fill, request_of, service_class
@@ -311,3 +312,45 @@ async def test_statuses_are_read_without_deserializing_them(world: World) -> Non
         assert read_statuses(serialized[:-1]) is None or count == 0
     publisher.close()
     subscription.close()
+
+
+async def test_a_server_knows_its_clients_by_their_identities(world: World) -> None:
+    taken: list[tuple[Hashable, int]] = []
+    service = world.node.describe(ECHO, "/port_own", None)
+    port = world.node.open_service(
+        service,
+        lambda _, header: taken.append((port.client_of(header), header.request_id.sequence_number)),
+    )
+    clients = [world.node.open_client(service, lambda *_: None) for _ in range(3)]
+    for client in clients:
+        await until(client.ready)
+        sent = [client.send(request_of("x")) for _ in range(2)]
+        await until(lambda: len(taken) == 2)
+        assert taken == [(client.identity, number) for number in sent]
+        taken.clear()
+    assert port.clients() >= {client.identity for client in clients}
+    assert len({client.identity for client in clients}) == 3
+    assert world.node.find_servers(service) == {port.identity}
+    for client in clients:
+        client.close()
+    await until(lambda: not port.clients() & {client.identity for client in clients})
+    port.stop()
+    port.close()
+
+
+async def test_clients_and_servers_of_a_node_are_of_one_process(world: World) -> None:
+    service = world.node.describe(ECHO, "/port_own", None)
+    port = world.node.open_service(service, lambda *_: None)
+    client = world.node.open_client(service, lambda *_: None)
+    assert process_of(port.identity) == process_of(client.identity) is not None
+    client.close()
+    port.stop()
+    port.close()
+
+
+async def test_publishers_are_counted(world: World) -> None:
+    assert world.node.count_publishers("/port_topic") == 0
+    publisher = world.node.open_publisher(GoalStatusArray, "/port_topic", TopicQos())
+    await until(lambda: world.node.count_publishers("/port_topic") == 1)
+    publisher.close()
+    await until(lambda: world.node.count_publishers("/port_topic") == 0)

@@ -158,8 +158,19 @@ class ServicePort(Protocol):
     def destroyed(self) -> bool:
         """Whether something other than rosasync has destroyed the service."""
 
+    @property
+    def identity(self) -> Hashable:
+        """What `NodePort.find_servers` shows for this service; None if it is unknown."""
+
     def client_of(self, header: RequestHeader) -> Hashable:
         """Return the identity of the client that sent a request; None if it is unknown."""
+
+    def clients(self) -> frozenset[Hashable]:
+        """Identify the clients that the graph shows; empty if the middleware does not.
+
+        Raises:
+            ContextShutdown: the node is down.
+        """
 
     def send(self, header: RequestHeader, response: Any) -> None:
         """Convert and send a response. From any thread, but not during or after `close`.
@@ -195,6 +206,10 @@ class ServicePort(Protocol):
 
 class ClientPort(Protocol):
     """One rcl client. Call its methods on the loop's thread; every one returns at once."""
+
+    @property
+    def identity(self) -> Hashable:
+        """What `ServicePort.client_of` shows for its requests; None if it is unknown."""
 
     def send(self, request: Any) -> int:
         """Send a request and return its sequence number, which grows with every send.
@@ -374,6 +389,13 @@ class NodePort(Protocol):
 
         If the middleware does not identify servers, the set has a placeholder for each server of
         the name.
+
+        Raises:
+            ContextShutdown: the node is down.
+        """
+
+    def count_publishers(self, topic_name: str) -> int:
+        """Return how many publishers a topic has, in all processes. Cheap.
 
         Raises:
             ContextShutdown: the node is down.

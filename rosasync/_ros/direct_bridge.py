@@ -168,6 +168,7 @@ class DirectClient:
         "_signals",
         "_take",
         "handle",
+        "identity",
         "quick",
         "send_request",
     )
@@ -191,6 +192,8 @@ class DirectClient:
         self._poll = poll
         self._deliver = deliver
         self.handle = client.handle
+        # Set by the node, which asks the graph.
+        self.identity: bytes | None = None
         self._response_type = client.srv_type.Response
         # rcl checks that its client is valid: after the destruction these raise.
         self.send_request = self.handle.send_request
@@ -348,6 +351,9 @@ class DirectService:
         self._responder = Responder(node, service, self.qos)
         self.send = self._responder.send
         self.client_of = client_of
+        # Set by the node, which asks the graph.
+        self.identity: bytes | None = None
+        self.clients = self._responder.clients
         self.has_clients = self._responder.has_clients
         self.delivered = self._responder.delivered
         self._closed = False

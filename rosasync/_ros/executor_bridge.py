@@ -129,17 +129,21 @@ class ExecutorClient:
         self._on_close = on_close
         self._closed = False
         self.handle = client.handle
+        # Set by the node, which asks the graph.
+        self.identity: bytes | None = None
         self._call_async = client.call_async
+        # rcl counts the same way, and does not show its number here.
         self._numbers = itertools.count(1)
         self._pending: dict[int, Any] = {}
 
     def send(self, request: Any) -> int:
         """Send a request and return a number for it; see `rosasync._core.ports.ClientPort`."""
-        number = next(self._numbers)
         try:
             future = self._call_async(request)
         except RclpyError as error:
             raise self._failure(error) from error
+        # After the send, because one that fails has no number.
+        number = next(self._numbers)
         self._pending[number] = future
         future.add_done_callback(functools.partial(self._complete, number))
         return number
@@ -220,6 +224,9 @@ class ExecutorService:
         self._responder = Responder(node, service, self.qos)
         self.send: Callable[[RequestHeader, Any], None] = self._responder.send
         self.client_of = client_of
+        # Set by the node, which asks the graph.
+        self.identity: bytes | None = None
+        self.clients = self._responder.clients
         self.has_clients = self._responder.has_clients
         self.delivered = self._responder.delivered
         service.send_response = self._taken

@@ -35,6 +35,7 @@ from rosasync._core.ports import (
 from rosasync._ros import configuration, discovery, names, profile, rcl
 from rosasync._ros.direct_bridge import DirectBridge
 from rosasync._ros.domain import check_domain, environment_domain
+from rosasync._ros.endpoints import response_readers, response_writers
 from rosasync._ros.executor_bridge import ExecutorBridge
 from rosasync._ros.executor_thread import ExecutorThread, ThreadUser, executor_thread_of
 from rosasync._ros.failures import (
@@ -46,6 +47,7 @@ from rosasync._ros.failures import (
     uses_node,
 )
 from rosasync._ros.graph import GraphQueries, GraphWaitable
+from rosasync._ros.identities import Identities
 from rosasync._ros.messages import make_message
 from rosasync._ros.shared_memory import check_ports
 from rosasync._ros.topics import Publisher, qos_profile
@@ -165,23 +167,29 @@ class RosNode:
     def open_client(self, service: Service, deliver: Deliver) -> ClientPort:
         """Create a client that passes its responses to ``deliver``."""
         try:
-            return self._opened.open_client(
+            created = self._identities.before(response_readers, service.key.srv_name)
+            client = self._opened.open_client(
                 service.srv_type, service.srv_name, _qos_of(service, self._client_depth()), deliver
             )
+            client.identity = created()
         except RclpyError as error:
             raise refusal(self._node, service, "client", error) from error
+        return client
 
     def open_service(self, service: Service, deliver: DeliverRequest) -> ServicePort:
         """Create a service that passes its requests to ``deliver``."""
         try:
-            return self._opened.open_service(
+            created = self._identities.before(response_writers, service.key.srv_name)
+            opened = self._opened.open_service(
                 service.srv_type,
                 service.srv_name,
                 _qos_of(service, names.DEPTH),
                 deliver,
             )
+            opened.identity = created()
         except RclpyError as error:
             raise refusal(self._node, service, "service", error) from error
+        return opened
 
     def describe_action(self, action_type: Any, action_name: str) -> Action:
         """Check and resolve an action."""
@@ -239,6 +247,11 @@ class RosNode:
         """Identify the servers that fit: by name, type and QoS."""
         return self._graph.find_servers(service)
 
+    def count_publishers(self, topic_name: str) -> int:
+        """Return how many publishers a topic has, in all processes."""
+        with uses_node(self._node):
+            return int(self._node.count_publishers(topic_name))
+
     def explain_missing(self, service: Service) -> str:
         """Describe what the graph shows instead of this service, as a clause."""
         return self._graph.explain_missing(service)
@@ -293,6 +306,7 @@ class RosNode:
         note_use()
         check_up(self._node)
         self._name = str(self._node.get_name())
+        self._identities = Identities(self._node)
         executor = options.executor
         librcl = rcl.load()
         if _takes_callbacks(executor or self._node.executor):

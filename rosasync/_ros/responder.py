@@ -6,6 +6,7 @@ import ctypes
 import struct
 import threading
 from collections import Counter
+from collections.abc import Hashable
 from dataclasses import dataclass
 from time import monotonic
 from typing import Any, NoReturn
@@ -169,6 +170,16 @@ class Responder:
             self._check_visible(header)
         elif unreached is not None:
             self._unreached.pop(unreached, None)
+
+    def clients(self) -> frozenset[Hashable]:
+        """Identify the clients that the graph shows, by the GUIDs of their response readers.
+
+        Raises:
+            ContextShutdown: the node is down.
+        """
+        with uses_node(self._node):
+            readers = response_readers(self._node, self._srv_name)
+            return frozenset(gid_of(reader) for reader in readers)
 
     def has_clients(self) -> bool:
         """Return whether the graph shows a client.

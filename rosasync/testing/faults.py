@@ -124,9 +124,18 @@ class FaultyService:
         """Whether something other than rosasync has destroyed the service."""
         return self._port.destroyed
 
+    @property
+    def identity(self) -> Hashable:
+        """What the graph shows for this service."""
+        return self._port.identity
+
     def client_of(self, header: RequestHeader) -> Hashable:
         """Return the identity of the client that sent a request."""
         return self._port.client_of(header)
+
+    def clients(self) -> frozenset[Hashable]:
+        """Identify the clients that the graph shows."""
+        return self._port.clients()
 
     def send(self, header: RequestHeader, response: Any) -> None:
         """Send a response as the faults say. From any thread."""

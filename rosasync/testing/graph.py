@@ -60,6 +60,19 @@ NAME = re.compile(r"/?[a-z_]\w*(/[a-z_]\w*)*", re.ASCII | re.IGNORECASE)
 """A name that ROS allows."""
 
 
+_numbers = itertools.count(1)
+
+
+def _new_process() -> bytes:
+    """Return what the identities of a process begin with, as long as in the middleware."""
+    return next(_numbers).to_bytes(12, "big")
+
+
+def _new_identity(process: bytes) -> bytes:
+    """Return the identity of a client or server of a process."""
+    return process + next(_numbers).to_bytes(4, "big")
+
+
 @dataclass(eq=False)
 class FakeServer:
     """A server in a `FakeGraph`.
@@ -69,6 +82,7 @@ class FakeServer:
             silently lost, as in the middleware.
         received: the requests handled, in order.
         lost: the number of requests lost.
+        identity: what the graph tells it by; its beginning names the process.
     """
 
     graph: FakeGraph
@@ -78,6 +92,7 @@ class FakeServer:
     depth: int = 10
     received: list[Any] = field(default_factory=list)
     lost: int = 0
+    identity: bytes = field(default_factory=lambda: _new_identity(_new_process()))
     _queue: deque[tuple[FakeClient, int, Any]] = field(default_factory=deque)
 
     def close(self) -> None:
@@ -151,8 +166,17 @@ class FakeService(FakeServer):
         self._loop = asyncio.get_running_loop()
 
     def client_of(self, header: Any) -> Hashable:
-        """Return the client that sent a request."""
-        return header.client  # type: ignore[no-any-return]
+        """Identify the client that sent a request."""
+        return header.client.identity  # type: ignore[no-any-return]
+
+    def clients(self) -> frozenset[Hashable]:
+        """Identify the clients of this name."""
+        return frozenset(
+            client.identity
+            for node in self.graph.nodes
+            for client in node.clients
+            if client.srv_name == self.srv_name
+        )
 
     def send(self, header: Any, response: Any) -> None:
         """Send a copy of a response. From any thread.
@@ -307,6 +331,7 @@ class FakeNode:
     ) -> None:
         self.graph = graph
         self.node = self
+        self.process = _new_process()
         self._loop = asyncio.get_running_loop()
         self._epoch = time.time_ns() - int(self._loop.time() * 1e9)
         self.up = True
@@ -384,6 +409,7 @@ class FakeNode:
     def open_service(self, service: Service, deliver: DeliverRequest) -> FakeService:
         """Create a service that passes its requests to ``deliver``."""
         opened = FakeService(self.graph, service.srv_type, service.key.srv_name, deliver)
+        opened.identity = _new_identity(self.process)
         self.graph.servers.append(opened)
         self.graph.changed()
         return opened
@@ -420,7 +446,14 @@ class FakeNode:
 
     def find_servers(self, service: Service) -> frozenset[Hashable]:
         """Identify the servers of this name and type."""
-        return frozenset(self.graph.find(service.key.srv_type, service.key.srv_name))
+        return frozenset(
+            server.identity
+            for server in self.graph.find(service.key.srv_type, service.key.srv_name)
+        )
+
+    def count_publishers(self, topic_name: str) -> int:
+        """Return how many publishers a topic has."""
+        return sum(publisher.topic_name == topic_name for publisher in self.graph.publishers)
 
     def explain_missing(self, service: Service) -> str:
         """List the services in the graph, with their types."""
@@ -460,11 +493,13 @@ class FakeClient:
         sent: the numbers of the requests sent, in order.
         out: the numbers of the outstanding requests.
         most: the maximum number of requests outstanding at once so far.
+        identity: what servers tell it by; its beginning names the process.
     """
 
     def __init__(self, node: FakeNode, key: ServiceKey, deliver: Deliver) -> None:
         self.node = node
         self.srv_name, self.srv_type, _ = key
+        self.identity = _new_identity(node.process)
         self.closed = False
         self.sent: list[int] = []
         self.out: set[int] = set()

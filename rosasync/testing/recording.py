@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import defaultdict
-from collections.abc import AsyncIterator, Callable, Iterable
+from collections.abc import AsyncIterator, Callable, Hashable, Iterable
 from contextlib import ExitStack, asynccontextmanager
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -174,6 +174,11 @@ class _RecordingClient:
         self._recording = recording
         self._unanswered: dict[int, RecordedCall] = {}
         self._port = opener(service, self._answered)
+
+    @property
+    def identity(self) -> Hashable:
+        """What servers know the client by."""
+        return self._port.identity
 
     def send(self, request: Any) -> int:
         """Send a request and record it."""
