@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from rosasync._actions.goal import Goal
+from rosasync._actions.proxy import ActionState, AsyncActionProxy
 from rosasync._actions.server import ActionServer
 from rosasync._actions.server_goal import ServerGoal
 from rosasync._actions.status import GoalStatus
@@ -49,7 +50,9 @@ from rosasync.typing import ActionType, ServiceType
 __all__ = [
     "ActionServer",
     "ActionServerStatistics",
+    "ActionState",
     "ActionType",
+    "AsyncActionProxy",
     "AsyncServiceProxy",
     "CallEnd",
     "CallError",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from rosasync._actions.goal import Goal
+from rosasync._actions.proxy import ActionState, AsyncActionProxy
 from rosasync._actions.server import ActionServer
 from rosasync._actions.server_goal import ServerGoal
 from rosasync._actions.status import GoalStatus
@@ -20,7 +21,9 @@ from rosasync.typing import ActionType
 __all__ = [
     "ActionServer",
     "ActionServerStatistics",
+    "ActionState",
     "ActionType",
+    "AsyncActionProxy",
     "CancelRejected",
     "Goal",
     "GoalAborted",

@@ -111,13 +111,23 @@ class Actions:
         arguments: ActArguments,
         timeout: float | None,
         on_feedback: Callable[[Any], Any] | None,
+        on_accepted: Callable[[Goal[Any, Any]], object] | None = None,
     ) -> Any:
-        """Send a goal and return its result; see `Session.act`."""
+        """Send a goal and return its result; see `Session.act`.
+
+        Args:
+            arguments: those of the goal.
+            timeout: seconds for all of it, None for no deadline.
+            on_feedback: called with each feedback message.
+            on_accepted: called with the goal when it is accepted.
+        """
         goal = self._new_goal()
         feedback = 1 if on_feedback is None else ACT_FEEDBACK
         try:
             async with asyncio.timeout(timeout) as deadline:
                 async with self._pursue(arguments, goal, feedback, CANCEL_TIMEOUT) as handle:
+                    if on_accepted is not None:
+                        on_accepted(handle)
                     if on_feedback is not None:
                         async for message in handle:
                             returned = on_feedback(message)

@@ -67,7 +67,9 @@ class Core:
         self.actions = Actions(
             self.node, self.pool, self.tracing, options.timeout, self._context_shut_down
         )
-        self.portal = Portal(self.node, self.gateway, self.arguments, self.pool, options.timeout)
+        self.portal = Portal(
+            self.node, self.gateway, self.arguments, self.pool, self.actions, options.timeout
+        )
         # A server removes itself when it ends, by its `on_end`.
         self.servers: dict[ServiceServer[Any, Any], None] = {}
         # The same. Their services are among the servers.

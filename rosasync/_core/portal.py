@@ -7,22 +7,33 @@ import contextlib
 import contextvars
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Coroutine, Mapping
 from concurrent.futures import CancelledError, Future, InvalidStateError
 from copy import deepcopy
 from typing import TYPE_CHECKING, Any, overload
 
 from rosasync._core.fork import check_fork
 from rosasync.errors import ResponseTimeout, SessionClosed, UsageError
-from rosasync.typing import RequestT, ResponseT, ServiceType, Timeout
+from rosasync.options import check_timeout
+from rosasync.typing import (
+    ActionType,
+    FeedbackT,
+    GoalT,
+    RequestT,
+    ResponseT,
+    ResultT,
+    ServiceType,
+    Timeout,
+)
 
 if TYPE_CHECKING:
     from rclpy.qos import QoSProfile
 
+    from rosasync._actions.registry import Actions
     from rosasync._client.pool import ClientPool
     from rosasync._core.arguments import ArgumentChecker
     from rosasync._core.gateway import LoopGateway
-    from rosasync._core.ports import NodePort, Service
+    from rosasync._core.ports import NodePort
     from rosasync.options import Retry
 
 __all__ = ["Portal"]
@@ -50,12 +61,14 @@ class Portal:
         gateway: LoopGateway,
         arguments: ArgumentChecker,
         pool: ClientPool,
+        actions: Actions,
         timeout: float | None,
     ) -> None:
         self._node = node
         self._gateway = gateway
         self._arguments = arguments
         self._pool = pool
+        self._actions = actions
         self._timeout = timeout
 
     def __repr__(self) -> str:
@@ -171,6 +184,67 @@ class Portal:
         submission.submit()
         return submission
 
+    @overload
+    def act(
+        self,
+        action_type: ActionType[GoalT, ResultT, FeedbackT],
+        action_name: str,
+        goal: GoalT | Mapping[str, Any] | None = None,
+        *,
+        timeout: float | None = None,
+        accept_timeout: Timeout = ...,
+        wait: bool | float = True,
+        on_feedback: Callable[[FeedbackT], Any] | None = None,
+    ) -> ResultT: ...
+
+    @overload
+    def act(
+        self,
+        action_type: str,
+        action_name: str,
+        goal: Any = None,
+        *,
+        timeout: float | None = None,
+        accept_timeout: Timeout = ...,
+        wait: bool | float = True,
+        on_feedback: Callable[[Any], Any] | None = None,
+    ) -> Any: ...
+
+    def act(
+        self,
+        action_type: Any,
+        action_name: str,
+        goal: Any = None,
+        *,
+        timeout: float | None = None,
+        accept_timeout: Timeout = ...,
+        wait: bool | float = True,
+        on_feedback: Callable[[Any], Any] | None = None,
+    ) -> Any:
+        """Send a goal, block this thread until it has ended, and return its result.
+
+        For the arguments and errors, see `Session.act`. ``on_feedback`` is called on the loop's
+        thread. If the wait is interrupted, for example by a KeyboardInterrupt, the goal is
+        cancelled.
+
+        Raises:
+            UsageError: on the loop's thread, or the executor's: it would deadlock.
+        """
+        self._check_loop("act")
+        self._check_executor()
+        seconds = check_timeout(timeout, None)
+        arguments = self._actions.arguments(action_type, action_name, goal, accept_timeout, wait)
+
+        def start(seconds: float | None) -> Coroutine[Any, Any, Any]:
+            return self._actions.act(arguments, seconds, on_feedback)
+
+        action = arguments.action
+        submission = _Submission(
+            self._gateway, self._check_executor, start, seconds, (action.name, action.type_name)
+        )
+        submission.submit()
+        return submission.wait()
+
     def _submission(
         self,
         srv_type: Any,
@@ -188,16 +262,12 @@ class Portal:
         )
         if copy:
             message = deepcopy(message)
-        return _Submission(
-            self._gateway,
-            self._pool,
-            self._check_executor,
-            service,
-            message,
-            seconds,
-            wait,
-            retry,
-        )
+
+        def start(seconds: float | None) -> Coroutine[Any, Any, Any]:
+            return self._pool.service_of(service).call(message, seconds, wait, retry)
+
+        name, type_name, _ = service.key
+        return _Submission(self._gateway, self._check_executor, start, seconds, (name, type_name))
 
     def _check_loop(self, instead: str) -> None:
         check_fork()
@@ -205,7 +275,7 @@ class Portal:
         if self._gateway.on_thread or self._gateway.on_loop:
             raise UsageError(
                 "session.from_thread is for other threads, and this is the thread of the session's "
-                f"own loop: use {'await ' if instead == 'call' else ''}session.{instead}(…)"
+                f"own loop: use {'' if instead == 'start' else 'await '}session.{instead}(…)"
             )
 
     def _check_executor(self) -> None:
@@ -218,31 +288,32 @@ class Portal:
 
 
 class _Submission(Future[Any]):
-    """A call that another thread waits for.
+    """A call, or a goal, that another thread waits for.
 
     The loop, the end of the session and a cancellation may each complete it. The first one wins.
+
+    Args:
+        gateway: the way into the loop.
+        check_executor: raises `UsageError` on the executor's thread.
+        start: returns the coroutine of the call, for the seconds that are left.
+        timeout: seconds for the whole call, None for no deadline.
+        names: the names of the service and its type.
     """
 
     def __init__(
         self,
         gateway: LoopGateway,
-        pool: ClientPool,
         check_executor: Callable[[], None],
-        service: Service,
-        request: Any,
+        start: Callable[[float | None], Coroutine[Any, Any, Any]],
         timeout: float | None,
-        wait: bool,
-        retry: Retry | None,
+        names: tuple[str, str],
     ) -> None:
         super().__init__()
         self._gateway = gateway
-        self._pool = pool
         self._check_executor = check_executor
-        self._service = service
-        self._request = request
+        self._start_call = start
         self._timeout = timeout
-        self._wait = wait
-        self._retry = retry
+        self._names = names
         self._submitted = time.monotonic()
         # The call runs in the context of its caller, for a trace.
         self._context = contextvars.copy_context()
@@ -301,7 +372,7 @@ class _Submission(Future[Any]):
             raise
         self.cancel()
         elapsed = time.monotonic() - self._submitted
-        srv_name, srv_type, _ = self._service.key
+        srv_name, srv_type = self._names
         raise ResponseTimeout(
             f"{srv_name}: the session's loop is stuck: it did not react for {elapsed:.3g} s, so a "
             "task or a callback blocks it",
@@ -356,8 +427,7 @@ class _Submission(Future[Any]):
         if seconds is not None:
             seconds = max(0.0, seconds - (time.monotonic() - self._submitted))
         try:
-            service = self._pool.service_of(self._service)
-            response = await service.call(self._request, seconds, self._wait, self._retry)
+            response = await self._start_call(seconds)
         except asyncio.CancelledError:
             self.fail(SessionClosed("the session's loop has ended"))
             raise

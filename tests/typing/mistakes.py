@@ -9,9 +9,10 @@ from __future__ import annotations
 from typing import Any
 
 from std_srvs.srv import SetBool, Trigger
+from test_msgs.action import Fibonacci
 
 import rosasync
-from rosasync import AsyncServiceProxy, ServiceCall
+from rosasync import AsyncActionProxy, AsyncServiceProxy, ServiceCall
 
 
 async def calls(session: rosasync.Session) -> None:
@@ -73,3 +74,18 @@ def ticks(session: rosasync.Session, by_name: Any) -> None:
     proxy = AsyncServiceProxy(session, SetBool, "/arm/enable")
     proxy.call_service(Trigger.Request())  # E: another type's request
     print(proxy.get_response().message)  # E: None until it is there
+
+
+async def goals(session: rosasync.Session) -> None:
+    result = await session.act(Fibonacci, "/fibonacci", {"order": 8})
+    print(result.sequenc)  # E: no such field
+    await session.act(Fibonacci, "/fibonacci", Fibonacci.Result())  # E (pyright): a result
+    await session.act(SetBool, "/fibonacci")  # E: a service type
+    await session.act(Fibonacci, "/fibonacci", timeout="2")  # E: no number of seconds
+    async with session.goal(Fibonacci, "/fibonacci") as goal:
+        async for feedback in goal:
+            print(feedback.sequenc)  # E: no such field
+        print((await goal.result()).sequenc)  # E: no such field
+    session.attach(Fibonacci, "/fibonacci", "7")  # E: no UUID
+    proxy = AsyncActionProxy(session, Fibonacci, "/fibonacci")
+    proxy.send_goal(Fibonacci.Result())  # E: a result

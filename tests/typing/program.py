@@ -8,9 +8,18 @@ from concurrent.futures import Future
 from typing import Any, Literal, assert_type
 
 from std_srvs.srv import SetBool, Trigger
+from test_msgs.action import Fibonacci
 
 import rosasync
-from rosasync import AsyncServiceProxy, LeasedClient, ServiceCall, ServiceClient, ServiceServer
+from rosasync import (
+    AsyncActionProxy,
+    AsyncServiceProxy,
+    Goal,
+    LeasedClient,
+    ServiceCall,
+    ServiceClient,
+    ServiceServer,
+)
 from rosasync.testing import Graph, StubServer
 
 NAME = "std_srvs/srv/SetBool"
@@ -122,3 +131,42 @@ async def generic(
 ) -> None:
     kind = kinds["enable"]
     assert_type(await session.call(kind, "/arm/enable", SetBool.Request()), SetBool.Response)
+
+
+ACTION = "test_msgs/action/Fibonacci"
+
+
+def on_feedback(feedback: Fibonacci.Feedback) -> None:
+    print(feedback.sequence)
+
+
+async def goals(session: rosasync.Session) -> None:
+    result = await session.act(Fibonacci, "/fibonacci", {"order": 8}, on_feedback=on_feedback)
+    assert_type(result, Fibonacci.Result)
+    assert_type(
+        await session.act(Fibonacci, "/fibonacci", Fibonacci.Goal(order=8), timeout=30.0),
+        Fibonacci.Result,
+    )
+    assert_type(await session.act(ACTION, "/fibonacci"), Any)
+    async with session.goal(Fibonacci, "/fibonacci", feedback=100) as goal:
+        assert_type(goal, Goal[Fibonacci.Result, Fibonacci.Feedback])
+        async for feedback in goal:
+            assert_type(feedback, Fibonacci.Feedback)
+        assert_type(await goal.result(), Fibonacci.Result)
+        async with session.attach(Fibonacci, "/fibonacci", goal.id) as same:
+            assert_type(same, Goal[Fibonacci.Result, Fibonacci.Feedback])
+    async with session.goal(ACTION, "/fibonacci") as named:
+        assert_type(named, Goal[Any, Any])
+
+
+def goals_of_threads(session: rosasync.Session) -> None:
+    assert_type(session.from_thread.act(Fibonacci, "/fibonacci"), Fibonacci.Result)
+    assert_type(session.from_thread.act(ACTION, "/fibonacci"), Any)
+
+
+def goals_of_ticks(session: rosasync.Session) -> None:
+    proxy = AsyncActionProxy(session, Fibonacci, "/fibonacci")
+    proxy.send_goal({"order": 8}, timeout=30.0)
+    assert_type(proxy.get_feedback(), Fibonacci.Feedback | None)
+    assert_type(proxy.get_result(), Fibonacci.Result | None)
+    assert_type(AsyncActionProxy(session, ACTION, "/fibonacci").get_result(), Any | None)
