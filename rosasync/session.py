@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Generic, Literal, NoReturn, Self, overload
 
-from rosasync._core.aio import call_in_thread, start_task
+from rosasync._core.aio import call_in_thread
 from rosasync._core.core import Core, session_closed
 from rosasync._ros.middleware import check_middleware
 from rosasync.errors import UsageError
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from rosasync._actions.intake import CancelHook, GoalHook
     from rosasync._actions.server import ActionServer
     from rosasync._client.pool import ClientPool
-    from rosasync._client.service_pool import ServicePool
+    from rosasync._client.service import ServicePool
     from rosasync._core.gateway import LoopGateway
     from rosasync._core.portal import Portal
     from rosasync._core.ports import NodePort
@@ -348,8 +348,7 @@ class Session:
         message, seconds = core.arguments.call(
             service.service, request, timeout, core.timeout, wait, retry
         )
-        call = service.call(message, seconds, wait, retry, copy=request is not None)
-        return start_task(core.loop, call)
+        return service.start(message, seconds, wait, retry, copy=request is not None)
 
     @overload
     def client(
@@ -430,7 +429,7 @@ class Session:
         The first query for a service may return False, because it takes some milliseconds to match
         a new client.
         """
-        return self._use().pool.service(srv_type, srv_name, qos).is_ready()
+        return self._use().pool.service(srv_type, srv_name, qos).match()
 
     @overload
     def serve(
@@ -896,7 +895,7 @@ class ServiceClient(Generic[RequestT, ResponseT]):
     def ready(self) -> bool:
         """Whether a server is matched, so that a call is sent at once."""
         self._core.check_loop()
-        return self._service.is_ready()
+        return self._service.match()
 
     async def call(
         self,
@@ -932,8 +931,7 @@ class ServiceClient(Generic[RequestT, ResponseT]):
             service.service, request, timeout, self._timeout, wait, retry
         )
         service.check_open()
-        call = service.call(message, seconds, wait, retry, copy=request is not None)
-        return start_task(core.loop, call)
+        return service.start(message, seconds, wait, retry, copy=request is not None)
 
     async def wait(self, timeout: Timeout = None) -> Literal[True]:
         """Wait until a server is matched, and return True; see `Session.wait_for_service`."""

@@ -378,6 +378,22 @@ async def test_calls_replaced_before_the_loop_sees_them_are_never_sent() -> None
         assert [request.load_namespace for request in received] == ["last"]
 
 
+async def test_calls_stopped_or_replaced_in_the_turn_in_which_the_server_comes_are_never_sent() -> (
+    None
+):
+    async with staged() as stage:
+        stage.proxy.call_service(request_of("replaced"))
+        stage.proxy.call_service(request_of("stopped"))
+        stage.proxy.stop_call()
+        stage.proxy.call_service(request_of("replaced, too"))
+        stage.proxy.call_service(request_of("last"))
+        stage.serve()
+        stage.answer()
+        assert stage.server is not None
+        assert await settled(stage.proxy) is READY
+        assert [request.load_namespace for request in stage.server.received] == ["last"]
+
+
 async def test_in_the_loop_the_request_is_sent_by_the_tick_that_asks() -> None:
     async with staged() as stage:
         stage.serve()

@@ -483,7 +483,7 @@ class ActionClient:
             left = limit if left is None else min(limit, left)
             if wait is False and not self.is_provided():
                 raise self.errors.unavailable(goal)
-        if not service.is_ready():
+        if not service.match():
             await service.wait_for_server(left)
         limit = self._loop.time() + MATCH_TIMEOUT
         if deadline is not None:
@@ -498,7 +498,7 @@ class ActionClient:
         if not self._matched:
             self._matched = (
                 self._results.ready()
-                and self._pool.service_of(self.action.cancel_goal).is_ready()
+                and self._pool.service_of(self.action.cancel_goal).match()
                 and self._feedback is not None
                 and self._feedback.publishers() > 0
             )

@@ -1,124 +1,230 @@
-"""One call: from the queue to the response."""
+"""One call: from the queue to its end."""
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
+
+from rosasync._client.retry import Action
+from rosasync._core.ports import PortDestroyed
 
 if TYPE_CHECKING:
     from rosasync._client.client import Client
-    from rosasync._client.retry import Attempts
-    from rosasync._core.ports import Servers
+    from rosasync._client.retry import Plan
+    from rosasync._client.sent import Sent
     from rosasync.tracing import CallTrace
 
-__all__ = ["Call"]
+__all__ = ["Call", "CallOwner"]
 
-NOT_SENT = 0
-"""Not a valid sequence number: rcl counts from 1."""
-TIMED = 16
-"""The first requests are timed, and then one of this many: to time each would make every call more
-expensive."""
+
+class CallOwner(Protocol):
+    """What a call reports to its service."""
+
+    def send_again(self, call: Call) -> None:
+        """Send a call again as soon as there are a server and a place."""
+
+    def drop(self, client: Client) -> None:
+        """Remove a client that other code has destroyed."""
 
 
 class Call:
-    """One request: queued, sent with a client, then answered or given up.
-
-    Confined to the loop's thread. From `start` to `end` it takes a place in the client's window. A
-    call on a lease (``leased``) uses the place of the lease instead.
+    """One call: queued, sent, perhaps sent again, and ended. Confined to the loop's thread.
 
     Attributes:
-        future: receives the response.
+        owner: its service.
+        future: receives the response, or the error that the caller gets.
         request: the message.
-        attempts: sends the request again; None if it is sent only once.
-        servers: the servers that the graph showed at the last attempt; None if they are not known
-            yet. `Client.learn_servers` sets them then.
-        started: whether `start` was called.
-        in_flight: whether it takes a place: it has started and not ended.
+        plan: decides when to send again; None if the request is sent only once.
+        lease: the leased client whose place the call uses; None if it takes one of its own.
         trace: follows the call, if something listens.
+        is_cancelled: returns whether the call was cancelled in a way that its future does not show
+            yet: the task of `Session.start` is cancelled before its first step, or another thread
+            has cancelled. Nothing may be sent then.
+        client: the client that sends it, set when it starts.
+        newest: the newest attempt that is outstanding; None before it is sent, and while there is
+            no server that has had it.
+        earlier: the attempts before it that are outstanding.
+        started: whether `start` was called.
+        in_flight: whether it has started and not ended.
     """
 
     __slots__ = (
-        "_leased",
-        "_sequence_number",
-        "attempts",
+        "_fast",
+        "_timer",
         "client",
+        "earlier",
         "future",
         "in_flight",
+        "is_cancelled",
+        "lease",
+        "newest",
+        "owner",
+        "plan",
         "request",
-        "servers",
         "started",
         "trace",
     )
 
     client: Client
-    servers: Servers | None
-    _sequence_number: int
 
     def __init__(
         self,
+        owner: CallOwner,
         future: asyncio.Future[Any],
         request: Any,
-        attempts: Attempts | None,
-        leased: bool = False,
+        plan: Plan | None = None,
+        lease: Client | None = None,
         trace: CallTrace | None = None,
+        is_cancelled: Callable[[], bool] | None = None,
     ) -> None:
+        self.owner = owner
         self.future = future
         self.request = request
-        self.attempts = attempts
+        self.plan = plan
+        self.lease = lease
         self.trace = trace
+        self.is_cancelled = is_cancelled
+        self.newest: Sent | None = None
+        self.earlier: tuple[Sent, ...] = ()
         self.started = False
         self.in_flight = False
-        self._leased = leased
+        # Started by each attempt except the last, for the next one. Stopped by the next attempt,
+        # by the loss of the servers, and by the end of the call.
+        self._timer: asyncio.TimerHandle | None = None
+        # Whether the next attempt is due because later requests were answered.
+        self._fast = False
 
-    def start(self, client: Client) -> None:
-        """Send the request. If that fails, set the error on the future."""
+    @property
+    def gone(self) -> bool:
+        """Whether nothing may be sent for the caller any more."""
+        return self.future.done() or (self.is_cancelled is not None and self.is_cancelled())
+
+    def start(self, client: Client, now: float) -> None:
+        """Send the request for the first time. If that fails, set the error on the future."""
         self.client = client
-        self.servers = client.servers
         self.started = self.in_flight = True
+        client.calls += 1
         counts = client.counts
         counts.in_flight += 1
         if counts.in_flight > counts.peak:
             counts.peak = counts.in_flight
         try:
-            sequence_number = client.send(self.request)
+            # Before `begin`, because a send that fails is no attempt.
+            self.newest = client.send(self, now)
         except Exception as error:
-            self.attempts = None
-            self._sequence_number = NOT_SENT
-            self.future.set_exception(error)
+            self.fail_send(error)
             return
         counts.sent += 1
-        client.unanswered[sequence_number] = self
-        self._sequence_number = sequence_number
-        if sequence_number < TIMED or not sequence_number % TIMED:
-            client.time_response(sequence_number)
         if self.trace is not None:
             self.trace.enter("sent")
-        if self.attempts is not None:
-            self.attempts.begin(self, client, sequence_number)
+        if self.plan is not None:
+            self.plan.begin()
+            client.retried[self] = None
+            self._wait(self.plan.next_delay())
 
-    def sent_again(self, sequence_number: int) -> None:
-        """Expect a response to another attempt as well."""
-        self.servers = self.client.servers
-        self.client.unanswered[sequence_number] = self
+    def send_again(self, now: float) -> None:
+        """Send the next attempt, if the plan allows it. There has to be a place for it."""
+        plan, client = self.plan, self.client
+        assert plan is not None
+        fast, self._fast = self._fast, False
+        if plan.begin() is not Action.SEND:
+            self._wait(plan.refused_delay())
+            return
+        if self.newest is not None:
+            # Before the send, which takes the place that this may give back.
+            client.window.supersede(self.newest)
+            self.earlier = (*self.earlier, self.newest)
+        try:
+            self.newest = client.send(self, now)
+        except Exception as error:
+            self.fail_send(error)
+            return
         if self.trace is not None:
             self.trace.enter("sent again")
+        client.counts.retried += 1
+        client.counts.fast_retries += fast
+        self._wait(plan.next_delay())
 
-    def lose_servers(self, error: Callable[[], Exception]) -> None:
-        """Go to the next server if the call may be retried; otherwise set the error."""
-        if self.attempts is not None:
-            self.attempts.lose_servers(error)
-        elif not self.future.done():
+    def on_later_answer(self, number: int) -> None:
+        """Take note that a request of the client was answered; the third later one is decisive."""
+        if self.plan is None or self.newest is None or number <= self.newest.number:
+            return
+        if self.plan.on_later_answer() is Action.SEND:
+            self._fast = True
+            self.owner.send_again(self)
+
+    def lose(self, lost: Sent, error: Callable[[], Exception]) -> None:
+        """Take note that no server has an attempt any more.
+
+        If it was the last one, go to the next server if the plan allows it; otherwise set the
+        error.
+        """
+        outstanding = [sent for sent in self.outstanding() if sent is not lost]
+        self.newest = outstanding[-1] if outstanding else None
+        self.earlier = tuple(outstanding[:-1])
+        if outstanding or self.future.done():
+            return
+        if self.plan is None or self.plan.on_servers_lost() is Action.FAIL:
             self.future.set_exception(error())
+            return
+        self._wait(None)
+        self.owner.send_again(self)
 
-    def end(self) -> None:
-        """Return the place to the client: the response has arrived, or the caller has left."""
+    def outstanding(self) -> list[Sent]:
+        """Return the attempts that may still be answered, in the order of their sends."""
+        sent = self.client.window.sent
+        attempts = self.earlier if self.newest is None else (*self.earlier, self.newest)
+        return [attempt for attempt in attempts if attempt.number in sent]
+
+    def end(self, now: float) -> None:
+        """Return what the call holds. Called once, by whoever is first:
+
+        - its client, as it delivers the response: so the place is free before the caller's task
+          runs, and an answered call holds nothing while that task waits for its turn;
+        - the caller, as it leaves `ServicePool.call` in any other way: cancelled, timed out, or
+          with the error that a lost server, a failed send or the end of the session has set.
+        """
         self.in_flight = False
         client = self.client
+        client.calls -= 1
         client.counts.in_flight -= 1
-        if self.attempts is not None:
-            self.attempts.end()
-        elif client.unanswered.pop(self._sequence_number, None) is not None:
-            client.abandon(self._sequence_number, self.servers)
-        if not self._leased:
-            client.release()
+        if not client.calls:
+            client.idle_since = now
+        newest = self.newest
+        if newest is not None and newest.number in client.window.sent:
+            client.leave(newest, now)
+        if self.plan is not None:
+            for sent in self.earlier:
+                if sent.number in client.window.sent:
+                    client.leave(sent, now)
+            self._wait(None)
+            client.retried.pop(self, None)
+        # Break the reference cycles.
+        self.newest = None
+        self.earlier = ()
+        # Last, because the assignment looks at the places that were given back above. This is
+        # `ClientOwner.on_places`, inlined because every call comes here.
+        owner = client.owner
+        if owner.queue or owner.resends or owner.leased:
+            owner.schedule()
+
+    def fail_send(self, error: Exception) -> None:
+        """End the call with the error of a failed send."""
+        if isinstance(error, PortDestroyed):
+            self.owner.drop(self.client)
+        if not self.future.done():
+            self.future.set_exception(error)
+
+    def _wait(self, delay: float | None) -> None:
+        """Wait for the next attempt; None for none."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        if delay is not None:
+            self._timer = self.future.get_loop().call_later(delay, self._on_due)
+
+    def _on_due(self) -> None:
+        self._timer = None
+        if not self.future.done() and self.plan is not None and self.plan.on_due() is Action.SEND:
+            self.owner.send_again(self)

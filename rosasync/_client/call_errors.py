@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from rosasync.errors import (
@@ -15,22 +17,34 @@ from rosasync.errors import (
 )
 
 if TYPE_CHECKING:
-    from rosasync._client.retry import Attempts
+    from rosasync._client.retry import Plan
     from rosasync._core.ports import NodePort, Service
 
-__all__ = ["CallErrors"]
+__all__ = ["AllServersGone", "CallErrors"]
+
+
+SHARED = 20
+"""How long a description of the graph is used again, in multiples of the time that it took."""
+
+
+class AllServersGone(Exception):
+    """Every server that had a request has vanished. Callers get `ServerGone` for it."""
 
 
 class CallErrors:
     """Makes the errors of one service's calls. ``elapsed`` is in seconds."""
 
-    def __init__(self, service: Service, node: NodePort) -> None:
+    def __init__(self, service: Service, node: NodePort, clock: Callable[[], float]) -> None:
         self._service = service
         self._node = node
+        self._clock = clock
+        # The last explanation of what the graph shows, and until when it may be used again.
+        self._seen = ""
+        self._seen_until = -math.inf
 
     def unavailable(self, elapsed: float) -> CallError:
         """Return the error for a call that found no server."""
-        seen = self._node.explain_missing(self._service)
+        seen = self._explain_missing()
         message = f"no server for {self._service.key.srv_type} after {elapsed:.3g} s; {seen}"
         return self._make(ServiceUnavailable, message, elapsed)
 
@@ -43,11 +57,11 @@ class CallErrors:
         )
         return self._make(QueueTimeout, message, elapsed)
 
-    def response_timeout(self, elapsed: float, attempts: Attempts | None) -> CallError:
+    def response_timeout(self, elapsed: float, plan: Plan | None) -> CallError:
         """Return the error for a request that was sent and not answered."""
         message = f"the request was sent, but not answered within {elapsed:.3g} s"
-        if attempts is not None:
-            message += attempts.explain_timeout()
+        if plan is not None:
+            message += plan.explain_timeout()
         return self._make(ResponseTimeout, message, elapsed)
 
     def server_gone(self, elapsed: float) -> CallError:
@@ -67,6 +81,20 @@ class CallErrors:
             f"{self._service.key.srv_name}: {waiting} callers already wait for a client, and "
             f"Limits.waiting={limit} allows no more: the server is slower than its callers"
         )
+
+    def _explain_missing(self) -> str:
+        """Describe what the graph shows instead of this service.
+
+        In a large graph this takes milliseconds, and many calls may time out together. So one
+        description serves for `SHARED` times as long as it took: the loop spends one part in that
+        many on it, however many calls fail.
+        """
+        now = self._clock()
+        if now >= self._seen_until:
+            self._seen = self._node.explain_missing(self._service)
+            ended = self._clock()
+            self._seen_until = ended + SHARED * (ended - now)
+        return self._seen
 
     def _make(self, kind: type[CallError], message: str, elapsed: float) -> CallError:
         name, type_name, _ = self._service.key

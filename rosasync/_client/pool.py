@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Generic, overload
 
 from rosasync._client.graph_watch import GraphWatch
 from rosasync._client.latency import summarize
-from rosasync._client.service_pool import MATCH_TIMEOUT, ServicePool
+from rosasync._client.service import MATCH_TIMEOUT, ServicePool
 from rosasync._core.aio import Deadlines
 from rosasync.errors import UsageError
 from rosasync.options import check_count, check_timeout
@@ -261,7 +261,7 @@ class LeasedClient(Generic[RequestT, ResponseT]):
                 service.service, request, timeout, self._timeout, retry=retry
             )
             response: ResponseT = await service.call(
-                message, seconds, retry=retry, leased=self._client
+                message, seconds, retry=retry, lease=self._client
             )
             return response
         finally:

@@ -1,19 +1,18 @@
-"""The attempts of a retried call, and the budget that bounds them."""
+"""When the request of a call is sent again, and the budget that bounds it for one service."""
 
 from __future__ import annotations
 
-import asyncio
+import enum
 import math
 import random
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from rosasync._client.call import Call
-    from rosasync._client.client import Client, Counts
+    from rosasync._client.counts import Counts
     from rosasync.options import Retry
 
-__all__ = ["Attempts", "RetryBudget"]
+__all__ = ["Action", "Plan", "RetryBudget"]
 
 FAST = 3
 """Answers to later requests of the client, after which a request is sent again at once."""
@@ -23,6 +22,20 @@ PER_SECOND = 10.0
 """Requests of a service that may be sent again in a second, whatever the share."""
 SAVED = 100.0
 """The maximum number of requests for which an unused budget is saved."""
+
+
+class Action(enum.Enum):
+    """What a call does after an event.
+
+    Attributes:
+        SEND: it is sent again, as soon as there are a server and a place.
+        WAIT: it goes on waiting.
+        FAIL: it ends with an error.
+    """
+
+    SEND = enum.auto()
+    WAIT = enum.auto()
+    FAIL = enum.auto()
 
 
 class RetryBudget:
@@ -61,161 +74,97 @@ class RetryBudget:
         return True
 
 
-class Attempts:
-    """Sends the request of one call again while it is unanswered.
+class Plan:
+    """Decides when the request of one call is sent again. It has no loop, timer or port.
 
-    The newest attempt takes the place of the call in the client's window. An earlier one takes a
-    place like an abandoned request, until it is known or presumed to have left the server's queue.
-    Confined to the loop's thread.
+    The call reports what happens, and does what the plan answers. Its servers get the request at
+    most `Retry.attempts` times, because every send asks `begin` first.
 
     Attributes:
-        call: the call, from `begin` to `end`.
+        sent: how many attempts were sent to the present servers; 0 if all have vanished.
         over_budget: whether the budget was used up when the request was to be sent again.
     """
 
-    __slots__ = (
-        "_budget",
-        "_client",
-        "_delay",
-        "_later_answers",
-        "_retry",
-        "_sent",
-        "_timer",
-        "call",
-        "over_budget",
-    )
+    __slots__ = ("_budget", "_delay", "_dice", "_later_answers", "_retry", "over_budget", "sent")
 
-    call: Call
-    _client: Client
-
-    def __init__(self, retry: Retry, budget: RetryBudget) -> None:
+    def __init__(
+        self, retry: Retry, budget: RetryBudget, dice: Callable[[], float] | None = None
+    ) -> None:
         self._retry = retry
         self._budget = budget
+        # Looked up here, so that a test can replace it.
+        self._dice = dice or random.random
         self._delay = retry.after
-        # The attempts that the present servers may have, by sequence number, in order.
-        self._sent: list[int] = []
         # The number of requests sent after the newest attempt and answered.
         self._later_answers = 0
-        # Each attempt except the last starts it, for the next one.
-        self._timer: asyncio.TimerHandle | None = None
+        self.sent = 0
         self.over_budget = False
 
-    @property
-    def sent(self) -> int:
-        """How many attempts were sent to the present servers; 0 if all have vanished."""
-        return len(self._sent)
-
-    @property
-    def needs_room(self) -> bool:
-        """Whether the newest attempt may still be in the server's queue."""
-        return bool(self._sent) and self._client.answered < self._sent[-1]
-
-    def begin(self, call: Call, client: Client, sequence_number: int) -> None:
-        """Start the timer for the second attempt.
-
-        Args:
-            call: the call, whose request was just sent.
-            client: the client that has sent it, and sends it again.
-            sequence_number: the number of the first attempt.
-        """
-        self.call = call
-        self._client = client
-        self._sent.append(sequence_number)
-        client.add_retried(self)
-        self._start_timer()
-
-    def send_again(self, cause: str = "") -> None:
-        """Send the request again, if the budget allows it.
-
-        If the newest attempt may still be in the server's queue, it keeps a place as long as there
-        is room.
-
-        Args:
-            cause: "fast" if later requests were answered.
-        """
-        self._client.cancel_resend(self)
-        if self.call.future.done():
-            return
-        # A new server has not been asked yet, so this cannot bury it.
-        if self._sent and not self._budget.take(self._retry.budget):
+    def begin(self) -> Action:
+        """Return SEND if an attempt may be sent now, and WAIT if not."""
+        if self.sent >= self._retry.attempts:
+            return Action.WAIT
+        # Servers that have not been asked yet cannot be buried.
+        if self.sent and not self._budget.take(self._retry.budget):
             self.over_budget = True
             self._later_answers = 0
-            self._wait(max(self._delay, 1 / PER_SECOND))
-            return
-        if self.needs_room and self._client.capacity > 0:
-            self._client.abandon(self._sent[-1], self.call.servers)
-        try:
-            sequence_number = self._client.send(self.call.request)
-        except Exception as error:
-            self.call.future.set_exception(error)
-            return
-        self._sent.append(sequence_number)
+            return Action.WAIT
+        self.sent += 1
         self._later_answers = 0
-        self.call.sent_again(sequence_number)
-        self._client.counts.retried += 1
-        self._client.counts.fast_retries += cause == "fast"
-        self._start_timer()
+        return Action.SEND
 
-    def note_answer(self, sequence_number: int) -> None:
-        """Send the request again at once if this is the third answer to a later request."""
-        if not self._sent or sequence_number <= self._sent[-1]:
-            return
+    def next_delay(self) -> float | None:
+        """Return the seconds until the next attempt is due, after one was sent.
+
+        None if there is none.
+        """
+        if self.sent >= self._retry.attempts:
+            return None
+        delay = self._delay
+        self._delay *= self._retry.backoff
+        return self._spread(delay)
+
+    def refused_delay(self) -> float | None:
+        """Return the seconds until the next attempt is due, after `begin` has refused one.
+
+        None if there is none.
+        """
+        if self.sent >= self._retry.attempts:
+            return None
+        return self._spread(max(self._delay, 1 / PER_SECOND))
+
+    def on_due(self) -> Action:
+        """Decide as the delay has passed."""
+        return Action.SEND if self.sent < self._retry.attempts else Action.WAIT
+
+    def on_later_answer(self) -> Action:
+        """Decide as a request was answered that was sent after the newest attempt."""
         self._later_answers += 1
         if self._later_answers == FAST and self.sent < self._retry.attempts:
-            self.send_again("fast")
+            return Action.SEND
+        return Action.WAIT
 
-    def lose_servers(self, error: Callable[[], Exception]) -> None:
-        """Send the request to the next server, or set the error if it may be sent only once."""
-        if self.call.future.done():
-            return
+    def on_servers_lost(self) -> Action:
+        """Decide as no server is left that has had an attempt.
+
+        The attempts start anew with the next server.
+        """
         if self._retry.attempts == 1:
-            self.call.future.set_exception(error())
-            return
-        self._stop_timer()
-        self._sent.clear()
+            return Action.FAIL
+        self.sent = 0
+        self._later_answers = 0
         self._delay = self._retry.after
-        self._client.queue_resend(self)
+        return Action.SEND
 
     def explain_timeout(self) -> str:
         """Describe the attempts, as a clause for the message of an error."""
-        if not self._sent:
+        if not self.sent:
             return "; its servers have vanished, and no other has come"
         clause = f"; sent {self.sent} times" if self.sent > 1 else ""
         if self.over_budget:
             clause += "; not sent again, because Retry.budget is used up for this service"
         return clause
 
-    def end(self) -> None:
-        """Abandon the attempts that are still outstanding."""
-        self._stop_timer()
-        client = self._client
-        client.remove_retried(self)
-        for sequence_number in self._sent:
-            if client.unanswered.pop(sequence_number, None) is None:
-                continue
-            if sequence_number == self._sent[-1] or client.has_place(sequence_number):
-                client.abandon(sequence_number, self.call.servers)
-            else:
-                client.expect_late(sequence_number)
-        del self.call  # Break the reference cycle.
-
-    def _start_timer(self) -> None:
-        if self.sent < self._retry.attempts:
-            self._wait(self._delay)
-            self._delay *= self._retry.backoff
-
-    def _wait(self, delay: float) -> None:
-        self._stop_timer()
+    def _spread(self, delay: float) -> float:
         # So that the requests of many callers, lost together, are not sent again together.
-        delay *= 1 + random.random() * JITTER
-        self._timer = self.call.future.get_loop().call_later(delay, self._on_timer)
-
-    def _on_timer(self) -> None:
-        self._timer = None
-        if not self.call.future.done():
-            self._client.queue_resend(self)
-
-    def _stop_timer(self) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
-            self._timer = None
+        return delay * (1 + self._dice() * JITTER)

@@ -61,6 +61,19 @@ class Deadlines:
             self._arm(deadline)
         return entry
 
+    async def wait(self, future: asyncio.Future[Any], deadline: float | None) -> None:
+        """Wait for a future until ``deadline``, in loop time; None for no deadline.
+
+        Raises:
+            Expired: the deadline passed.
+        """
+        entry = None if deadline is None else self.set(future, deadline)
+        try:
+            await future
+        finally:
+            if entry is not None:
+                entry[-1] = None
+
     def close(self) -> None:
         """Drop all deadlines; idempotent."""
         self._heap.clear()

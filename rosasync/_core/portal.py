@@ -38,6 +38,9 @@ if TYPE_CHECKING:
 
 __all__ = ["Portal"]
 
+IsCancelled = Callable[[], bool]
+"""Returns whether the caller has cancelled."""
+
 POLL_LOOP = 0.5
 """Seconds after which a blocked thread checks again whether the loop has been closed."""
 
@@ -235,7 +238,7 @@ class Portal:
         seconds = check_timeout(timeout, None)
         arguments = self._actions.arguments(action_type, action_name, goal, accept_timeout, wait)
 
-        def start(seconds: float | None) -> Coroutine[Any, Any, Any]:
+        def start(seconds: float | None, _: IsCancelled) -> Coroutine[Any, Any, Any]:
             return self._actions.act(arguments, seconds, on_feedback)
 
         action = arguments.action
@@ -263,8 +266,9 @@ class Portal:
         if copy:
             message = deepcopy(message)
 
-        def start(seconds: float | None) -> Coroutine[Any, Any, Any]:
-            return self._pool.service_of(service).call(message, seconds, wait, retry)
+        def start(seconds: float | None, is_cancelled: IsCancelled) -> Coroutine[Any, Any, Any]:
+            pool = self._pool.service_of(service)
+            return pool.call(message, seconds, wait, retry, is_cancelled=is_cancelled)
 
         name, type_name, _ = service.key
         return _Submission(self._gateway, self._check_executor, start, seconds, (name, type_name))
@@ -295,7 +299,8 @@ class _Submission(Future[Any]):
     Args:
         gateway: the way into the loop.
         check_executor: raises `UsageError` on the executor's thread.
-        start: returns the coroutine of the call, for the seconds that are left.
+        start: returns the coroutine of the call, for the seconds that are left, and a function
+            that returns whether the call was cancelled in the meantime.
         timeout: seconds for the whole call, None for no deadline.
         names: the names of the service and its type.
     """
@@ -304,7 +309,7 @@ class _Submission(Future[Any]):
         self,
         gateway: LoopGateway,
         check_executor: Callable[[], None],
-        start: Callable[[float | None], Coroutine[Any, Any, Any]],
+        start: Callable[[float | None, IsCancelled], Coroutine[Any, Any, Any]],
         timeout: float | None,
         names: tuple[str, str],
     ) -> None:
@@ -427,7 +432,7 @@ class _Submission(Future[Any]):
         if seconds is not None:
             seconds = max(0.0, seconds - (time.monotonic() - self._submitted))
         try:
-            response = await self._start_call(seconds)
+            response = await self._start_call(seconds, self.cancelled)
         except asyncio.CancelledError:
             self.fail(SessionClosed("the session's loop has ended"))
             raise

@@ -282,7 +282,13 @@ class AsyncServiceProxy(Generic[RequestT, ResponseT]):
             await service.wait_for_server(operation.time_left())
             return ProxyState.SERVICE_AVAILABLE, None
         response = await service.call(
-            operation.request, operation.time_left(), operation.wait, self._retry, copy=True
+            operation.request,
+            operation.time_left(),
+            operation.wait,
+            self._retry,
+            copy=True,
+            # The task is cancelled later: by `_reconcile`, and then in its next step.
+            is_cancelled=lambda: self._operation is not operation,
         )
         return ProxyState.RESPONSE_READY, response
 

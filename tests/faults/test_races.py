@@ -18,8 +18,9 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 from hypothesis.stateful import run_state_machine_as_test as run_machine
 
 from rosasync import Limits, Retry, RosasyncError
-from rosasync._client.service_pool import ServicePool
+from rosasync._client.service import ServicePool
 from rosasync.testing import FakeGraph, FakeServer
+from tests.support.places import check_places
 from tests.support.plain import Echo, echo
 
 MOST = 100.0
@@ -167,15 +168,10 @@ class Races(RuleBasedStateMachine):
 
     @invariant()
     def places_are_neither_lost_nor_doubled(self) -> None:
-        for client in self.service.clients:
-            assert 0 <= client.leases <= self.limits.in_flight
-        assert len(self.service.clients) <= self.limits.clients
+        check_places(self.service, self.limits, self.leases)
         statistics = self.service.statistics()
         assert statistics.in_flight >= 0
         assert statistics.abandoned >= 0
-        assert statistics.in_flight + statistics.abandoned <= max(
-            statistics.window, self.limits.in_flight * self.limits.clients
-        )
 
     @invariant()
     def first_come_first_served(self) -> None:
@@ -202,7 +198,7 @@ class Races(RuleBasedStateMachine):
             self._run(asyncio.sleep(MOST))
             statistics = self.service.statistics()
             assert (statistics.in_flight, statistics.waiting, statistics.abandoned) == (0, 0, 0)
-            assert all(client.leases == 0 for client in self.service.clients)
+            assert all(client.window.taken == 0 for client in self.service.clients)
             ended = statistics.completed + statistics.timed_out
             ended += statistics.cancelled + statistics.failed
             # The wait for a lease is not counted.

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-import random
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -20,9 +18,9 @@ from rosasync import (
     SessionClosed,
 )
 from rosasync._client import response_times, retry
-from rosasync._client.client import Counts
-from rosasync._client.retry import Attempts, RetryBudget
-from rosasync._client.service_pool import GONE_DELAY
+from rosasync._client.counts import Counts
+from rosasync._client.matching import GONE_DELAY
+from rosasync._client.retry import Action, Plan, RetryBudget
 from rosasync.testing import FakeNode
 from tests.support.echo import ECHO, answer_to, request_of
 from tests.support.plain import Echo, echo
@@ -114,9 +112,11 @@ class TestFastRetransmit:
                 lost = start(session, "lost", retry=FAST_ONLY)
                 once = start(session, "lost", retry=Retry(attempts=1))
                 port = next(iter(fake_graph.nodes[0].clients))
-                for number in range(4, 10):
-                    # The answer to a request that was never made: only its number counts.
-                    port.deliver(number, Echo.Response())
+                for _ in range(6):
+                    # Its request is dropped too, and only its answer is made up.
+                    other = start(session, "other")
+                    port.deliver(port.sent[-1], Echo.Response())
+                    await other
             assert session.pool.statistics().retried == 1
             for task in (lost, once):
                 task.cancel()
@@ -165,6 +165,7 @@ class TestRoom:
                 # One of the places becomes free, but for the client alone: the server is held.
                 port = next(iter(fake_graph.nodes[0].clients))
                 port.deliver(port.sent[-1], Echo.Response(2))
+                await asyncio.sleep(0)
                 assert session.pool.statistics().retried == 1
                 assert session.pool.statistics().abandoned == 0
                 task.cancel()
@@ -305,47 +306,145 @@ class Bucket:
         return taken
 
 
-@pytest.fixture
-async def delays(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """The delays of the timers of attempts."""
-    loop = asyncio.get_running_loop()
-    call_later = loop.call_later
-    recorded: list[float] = []
+class Spender:
+    """A budget that has some tokens, and no more."""
 
-    def spy(
-        delay: float, callback: Callable[..., object], *args: Any, **options: Any
-    ) -> asyncio.TimerHandle:
-        if getattr(callback, "__func__", None) is Attempts._on_timer:
-            recorded.append(delay)
-        return call_later(delay, callback, *args, **options)
+    def __init__(self, tokens: int) -> None:
+        self.tokens = tokens
 
-    monkeypatch.setattr(loop, "call_later", spy)
-    return recorded
+    def take(self, share: float) -> bool:
+        self.tokens -= 1
+        return self.tokens >= 0
 
 
-@pytest.mark.parametrize(("dice", "factor"), [(0.0, 1.0), (0.5, 1.125), (1.0, 1.25)])
-async def test_the_delays_have_jitter(
-    fake_graph: FakeGraph,
-    monkeypatch: pytest.MonkeyPatch,
-    delays: list[float],
-    dice: float,
-    factor: float,
-) -> None:
-    monkeypatch.setattr(random, "random", lambda: dice)
+def planned(
+    attempts: int = 3,
+    after: float = 1.0,
+    backoff: float = 2.0,
+    *,
+    dice: float = 0.0,
+    tokens: int = 9,
+) -> Plan:
+    """Return a plan whose first attempt was sent."""
+    budget: Any = Spender(tokens)
+    plan = Plan(Retry(attempts, after, backoff), budget, lambda: dice)
+    assert plan.begin() is Action.SEND
+    return plan
+
+
+class TestPlan:
+    """The policy in tables: what a call does after each event."""
+
+    @pytest.mark.parametrize(
+        ("attempts", "delays"),
+        [(1, [None]), (2, [1.0, None]), (4, [1.0, 2.0, 4.0, None])],
+    )
+    def test_the_delays_grow_up_to_the_last_attempt(
+        self, attempts: int, delays: list[float | None]
+    ) -> None:
+        plan = planned(attempts)
+        seen = [plan.next_delay()]
+        while plan.on_due() is Action.SEND:
+            assert plan.begin() is Action.SEND
+            seen.append(plan.next_delay())
+        assert seen == delays
+
+    @pytest.mark.parametrize(("dice", "factor"), [(0.0, 1.0), (0.5, 1.125), (1.0, 1.25)])
+    def test_the_delays_have_jitter(self, dice: float, factor: float) -> None:
+        plan = planned(dice=dice)
+        assert plan.next_delay() == factor
+        plan.begin()
+        assert plan.next_delay() == 2 * factor
+
+    def test_the_jitter_differs(self, fake_graph: FakeGraph) -> None:
+        budget = Bucket().budget
+        delays = [Plan(Retry(), budget).next_delay() for _ in range(10)]
+        assert len(set(delays)) > 1
+        assert all(delay is not None and 0.5 <= delay <= 0.625 for delay in delays)
+
+    def test_the_third_later_answer(self) -> None:
+        plan = planned(attempts=3)
+        send, wait = Action.SEND, Action.WAIT
+        assert [plan.on_later_answer() for _ in range(5)] == [wait, wait, send, wait, wait]
+        plan.begin()
+        assert [plan.on_later_answer() for _ in range(4)] == [wait, wait, send, wait]
+        plan.begin()
+        assert [plan.on_later_answer() for _ in range(9)] == [wait] * 9
+
+    def test_never_more_often_than_its_attempts(self) -> None:
+        plan = planned(attempts=2)
+        assert [plan.on_later_answer() for _ in range(3)][-1] is Action.SEND
+        assert plan.begin() is Action.SEND
+        # The delay of the first attempt passes after the second was sent ahead of it.
+        assert plan.on_due() is Action.WAIT
+        assert plan.begin() is Action.WAIT
+        assert (plan.sent, plan.next_delay(), plan.refused_delay()) == (2, None, None)
+
+    def test_beyond_the_budget_it_waits_on(self) -> None:
+        plan = planned(attempts=9, after=0.01, tokens=1)
+        assert plan.begin() is Action.SEND
+        assert not plan.over_budget
+        assert plan.begin() is Action.WAIT
+        assert (plan.sent, plan.over_budget) == (2, True)
+        assert plan.refused_delay() == 0.1
+        assert plan.on_due() is Action.SEND
+
+    def test_lost_servers(self) -> None:
+        plan = planned(attempts=2, tokens=0)
+        plan.next_delay()
+        assert plan.on_servers_lost() is Action.SEND
+        assert plan.explain_timeout() == "; its servers have vanished, and no other has come"
+        # Whatever the budget: the next server has not been asked.
+        assert plan.begin() is Action.SEND
+        assert (plan.sent, plan.next_delay()) == (1, 1.0)
+        assert planned(attempts=1).on_servers_lost() is Action.FAIL
+
+    @pytest.mark.parametrize(
+        ("sent", "tokens", "clause"),
+        [
+            (1, 9, ""),
+            (3, 9, "; sent 3 times"),
+            (2, 0, "; not sent again, because Retry.budget is used up for this service"),
+        ],
+    )
+    def test_what_a_timeout_says(self, sent: int, tokens: int, clause: str) -> None:
+        plan = planned(tokens=tokens)
+        for _ in range(sent - 1):
+            plan.begin()
+        assert plan.explain_timeout() == clause
+
+
+async def test_a_call_follows_its_plan(fake_graph: FakeGraph) -> None:
     fake_graph.serve(Echo, "/echo", echo)
     async with fake_graph.session() as session:
         await ask(session, 0)
-        with fake_graph.drop_requests(), pytest.raises(ResponseTimeout):
-            await ask(session, 1, retry=Retry(3, TICK / 10, 2.0), timeout=TICK)
-    assert delays == pytest.approx([factor * TICK / 10, factor * TICK / 5])
+        with fake_graph.drop_requests():
+            for attempts in (1, 2, 4):
+                before = sent(fake_graph)
+                with pytest.raises(ResponseTimeout):
+                    await ask(session, 1, retry=Retry(attempts, 0.0, 1.0, math.inf), timeout=TICK)
+                assert sent(fake_graph) - before == attempts
 
 
-async def test_the_jitter_differs(fake_graph: FakeGraph, delays: list[float]) -> None:
+async def test_a_retransmission_is_the_last_attempt_although_the_delay_of_the_first_still_runs(
+    fake_graph: FakeGraph,
+) -> None:
     fake_graph.serve(Echo, "/echo", echo)
-    async with fake_graph.session() as session:
-        await asyncio.gather(*(ask(session, n, retry=Retry()) for n in range(10)))
-    assert len(set(delays)) > 1
-    assert all(0.5 <= delay <= 0.625 for delay in delays)
+    async with fake_graph.session(limits=Limits(in_flight=100)) as session:
+        await ask(session, 0)
+        with fake_graph.drop_requests():
+            lost = start(session, "lost", retry=Retry(2, TICK), timeout=4 * TICK)
+            before = sent(fake_graph)
+            port = next(iter(fake_graph.nodes[0].clients))
+            for _ in range(3):
+                other = start(session, "other")
+                port.deliver(port.sent[-1], Echo.Response())
+                await other
+            await asyncio.sleep(0)
+            assert session.pool.statistics().fast_retries == 1
+            with pytest.raises(ResponseTimeout, match="sent 2 times"):
+                await lost
+            assert sent(fake_graph) - before == 3 + 1
 
 
 @pytest.mark.usefixtures("patient")
@@ -394,7 +493,7 @@ class TestNextServer:
                     server.close()
                     server = fake_graph.serve(Echo, "/echo", echo)
                 await until(lambda: session.pool.statistics().retried >= 8)
-            fake_graph.changed()
+                fake_graph.changed()
             server.close()
             server = fake_graph.serve(Echo, "/echo", echo)
             assert (await asyncio.wait_for(task, LIMIT)).value == 1

@@ -1,18 +1,14 @@
-"""Places in the window: when the place of an abandoned request comes back."""
+"""Places in the window, on fake ports: who gets the place of a lost or abandoned request."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from rosasync import Limits, QueueTimeout, ResponseTimeout, Session
+from rosasync import Limits, QueueTimeout, ResponseTimeout, Retry, Session
 from rosasync._client import response_times
-from rosasync._client.client import Client
-from rosasync._client.response_times import ResponseTimes
 from tests.support.plain import Echo, echo
 from tests.support.times import LIMIT, TICK, until
 
@@ -123,64 +119,6 @@ async def test_while_no_caller_waits_the_places_are_kept(fake_graph: FakeGraph) 
         assert await ask(session, 1) == 1
 
 
-async def test_only_one_place_in_each_time_without_answers(
-    fake_graph: FakeGraph, patience: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    loop = asyncio.get_running_loop()
-    call_at = loop.call_at
-    due: list[float] = []
-
-    def spy(
-        when: float, callback: Callable[..., object], *args: Any, **options: Any
-    ) -> asyncio.TimerHandle:
-        if getattr(callback, "__func__", None) is Client._on_timer:
-            due.append(when)
-        return call_at(when, callback, *args, **options)
-
-    fake_graph.serve(Echo, "/echo", echo)
-    async with fake_graph.session(limits=Limits(in_flight=3, grace=LONG)) as session:
-        await ask(session, 0)
-        port = the_port(fake_graph)
-        with fake_graph.drop_requests():
-            await abandon(session, 3)
-            monkeypatch.setattr(loop, "call_at", spy)
-            tasks = [session.start(Echo, "/echo", Echo.Request(n)) for n in range(3)]
-            for places in (1, 2, 3):
-                await until(lambda n=places: len(port.sent) >= 4 + n)  # type: ignore[misc]
-                total = session.pool.statistics()
-                assert total.in_flight + total.abandoned == 3
-            assert len(port.sent) == 7
-        for task in tasks:
-            task.cancel()
-        await asyncio.wait(tasks)
-    waits = [later - earlier for earlier, later in pairwise(due)]
-    assert len([wait for wait in waits if wait >= patience]) >= 2
-    assert not [wait for wait in waits if 0 < wait < patience]
-
-
-@pytest.mark.parametrize("answered", [False, True])
-@pytest.mark.parametrize("patience", [100 * LIMIT], indirect=True)
-async def test_an_answer_begins_the_time_again(
-    fake_graph: FakeGraph, patience: float, answered: bool
-) -> None:
-    fake_graph.serve(Echo, "/echo", echo)
-    async with fake_graph.session(limits=Limits(in_flight=2, grace=LONG * LIMIT)) as session:
-        await ask(session, 0)
-        (client,) = session.pool.service(Echo, "/echo", None).clients
-        port = the_port(fake_graph)
-        with fake_graph.drop_requests():
-            await abandon(session, 2)
-        client._silent_since -= 2 * patience
-        if answered:
-            # To none of them: the server is alive, and may still answer them.
-            port.deliver(1, Echo.Response())
-        waiting = session.start(Echo, "/echo", Echo.Request(1), timeout=None)
-        await asyncio.sleep(TICK)
-        assert len(port.sent) == (3 if answered else 4)
-        waiting.cancel()
-        await asyncio.wait([waiting])
-
-
 @pytest.mark.parametrize("patience", [100 * LIMIT], indirect=True)
 @pytest.mark.usefixtures("patience")
 async def test_a_new_server_has_none_of_the_abandoned_requests(fake_graph: FakeGraph) -> None:
@@ -201,70 +139,48 @@ async def test_a_new_server_has_none_of_the_abandoned_requests(fake_graph: FakeG
         assert session.pool.statistics().abandoned == 0
 
 
-async def test_what_was_sent_before_a_new_server_came_takes_no_place_afterwards(
-    fake_graph: FakeGraph,
+@pytest.mark.parametrize("retry", [None, Retry(2, LONG)])
+@pytest.mark.usefixtures("patience")
+async def test_calls_that_are_out_on_a_dead_server_do_not_hold_up_the_next_one(
+    fake_graph: FakeGraph, retry: Retry | None
 ) -> None:
     fake_graph.serve(Echo, "/echo", echo)
-    async with fake_graph.session(limits=Limits(grace=LONG)) as session:
+    async with fake_graph.session(timeout=None) as session:
         await ask(session, 0)
-        await asyncio.sleep(0)
         with fake_graph.drop_requests():
-            early = session.start(Echo, "/echo", Echo.Request(1), timeout=None)
+            out = [session.start(Echo, "/echo", retry=retry) for _ in range(10)]
+        waiting = [session.start(Echo, "/echo", Echo.Request(n)) for n in range(20)]
+        # The graph still shows the old server, as it does for seconds if a process was killed.
         fake_graph.serve(Echo, "/echo", echo)
-        with fake_graph.drop_requests():
-            late = session.start(Echo, "/echo", Echo.Request(2), timeout=None)
-            # The servers are queried in the turn after the match.
-            await asyncio.sleep(0)
-            await asyncio.sleep(0)
-        for task, abandoned in ((early, 0), (late, 1)):
-            task.cancel()
-            await asyncio.wait([task])
-            assert session.pool.statistics().abandoned == abandoned
+        answers = await asyncio.wait_for(asyncio.gather(*waiting), LIMIT)
+        assert [answer.value for answer in answers] == list(range(20))
+        total = session.pool.statistics()
+        if retry is None:
+            assert (total.in_flight, total.abandoned) == (10, 0)
+            for task in out:
+                task.cancel()
+        # The others have gone to the next server, after the answers to three later requests.
+        await asyncio.wait_for(asyncio.wait(out), LIMIT)
+        assert session.pool.statistics().idle == 1
 
 
-def test_patience_is_a_multiple_of_the_lowest_response_time() -> None:
-    times = ResponseTimes()
-    assert times.patience == 1.0
-    times.add(0.125)
-    assert times.patience == 0.5
-    times.add(0.0625)
-    assert times.patience == 0.25
-
-
-def test_a_slow_server_makes_a_client_patient() -> None:
-    times = ResponseTimes()
-    for _ in range(15):
-        times.add(3.0)
-    assert 6.0 < times.patience < 12.0
-
-
-def test_patience_has_a_minimum() -> None:
-    times = ResponseTimes()
-    times.add(0.0001)
-    assert times.patience == 0.2
-
-
-def test_losses_that_are_repaired_late_do_not_make_a_client_patient() -> None:
-    times = ResponseTimes()
-    for _ in range(100):
-        times.add(3.0)
-        times.add(0.001)
-        times.add(0.001)
-    times.add(1.0)
-    assert times.patience < 0.5
-
-
-async def test_a_slow_response_is_seen_although_its_caller_has_left(
+@pytest.mark.parametrize("patience", [100 * LIMIT], indirect=True)
+@pytest.mark.usefixtures("patience")
+async def test_while_the_old_server_answers_the_next_one_costs_no_call_its_answer(
     fake_graph: FakeGraph,
 ) -> None:
-    fake_graph.serve(Echo, "/echo", echo)
-    async with fake_graph.session() as session:
-        with fake_graph.delay_responses(6 * TICK):
-            with pytest.raises(ResponseTimeout):
-                await ask(session, 1, timeout=TICK)
-            (client,) = session.pool.service(Echo, "/echo", None).clients
-            await until(lambda: session.pool.statistics().late == 1)
-        assert client._response_times.patience > 1.0
+    old = fake_graph.serve(Echo, "/echo", echo)
+    async with fake_graph.session(timeout=None) as session:
+        await ask(session, 0)
+        with fake_graph.hold_requests():
+            calls = [session.start(Echo, "/echo", Echo.Request(n)) for n in range(30)]
+            await until(lambda: session.pool.statistics().in_flight == 10)
+            fake_graph.serve(Echo, "/echo", echo)
+            await asyncio.sleep(TICK)
+            assert session.pool.statistics().in_flight == 10
+        answers = await asyncio.gather(*calls)
+    assert [answer.value for answer in answers] == list(range(30))
+    assert old.lost == 0
 
 
 async def test_the_statistics_show_the_window(fake_graph: FakeGraph) -> None:

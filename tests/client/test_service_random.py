@@ -13,9 +13,10 @@ import pytest
 
 from rosasync import Limits, Retry, RosasyncError, Session
 from rosasync._client import response_times
-from rosasync._client.service_pool import ServicePool
+from rosasync._client.service import ServicePool
 from rosasync._core.ports import PortDestroyed
 from rosasync.testing import FakeClient, FakeGraph, FakeServer
+from tests.support.places import check_places
 from tests.support.times import TICK, until
 
 SHORT = TICK / 10
@@ -174,13 +175,7 @@ class Run:
 
     def check(self) -> None:
         """Check what holds at any time, and how tasks have ended."""
-        assert len(self.service.clients) <= self.limits.clients
-        for client in self.service.clients:
-            assert 0 <= client.leases <= self.limits.in_flight
-            # Each has a place, or is an attempt that is known or presumed to have left the queue. A
-            # lease whose call was cancelled waits for its place before the next call.
-            places = max(client.window, self.limits.in_flight) + self.open_leases
-            assert client.leases + client.abandoned <= places
+        check_places(self.service, self.limits, self.open_leases)
         for task in [task for task in self.tasks if task.done()]:
             number = self.tasks.pop(task)
             if task.cancelled():
@@ -188,7 +183,8 @@ class Run:
             error = task.exception()
             assert error is None or isinstance(error, RosasyncError)
             response = None if error else task.result()
-            assert response is None or response.value == number
+            # True is the result of a wait for the service.
+            assert response in (None, True) or response.value == number
 
     async def end(self) -> None:
         """Have every call end, and check that nothing is left."""
@@ -199,13 +195,14 @@ class Run:
             self.check()
             # Lost requests of calls without a deadline; the servers hold nothing back any more.
             for client in self.service.clients:
-                for call in client.unanswered.values():
-                    call.future.cancel()
+                for sent in client.window.sent.values():
+                    if sent.call is not None:
+                        sent.call.future.cancel()
             return not self.tasks and not self.service.is_busy
 
         await until(ended)
         for client in self.service.clients:
-            assert client.leases == 0
+            assert client.window.leases == client.window.taken == 0
         statistics = self.service.statistics()
         assert (statistics.in_flight, statistics.abandoned, statistics.waiting) == (0, 0, 0)
 
@@ -280,7 +277,7 @@ async def test_random_operations_leave_nothing_behind(
                 await run.step(number)
             await run.end()
             # Nothing polls while nothing is pending; a deadline that was met may still run out.
-            await until(lambda: timers() <= {"ClientSet._evict", "Deadlines._expire"})
+            await until(lambda: timers() <= {"Clients._evict", "Deadlines._expire"})
         # First come, first served: those who gave up before their turn are not among them.
         in_order = [number for number in sent if number in run.in_line]
         assert in_order == sorted(in_order), seed

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import gc
 import logging
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
@@ -37,22 +39,29 @@ def the_client(graph: FakeGraph) -> FakeClient:
     return client
 
 
+@contextlib.contextmanager
+def sends(graph: FakeGraph, send: Callable[[Any], int]) -> Iterator[None]:
+    """Send with this function instead, in this block."""
+    port: Any = the_client(graph)
+    port.send = send
+    try:
+        yield
+    finally:
+        del port.send
+
+
 async def test_a_send_that_fails_gives_its_place_back(fake_graph: FakeGraph) -> None:
     fake_graph.serve(Echo, "/echo", echo)
     async with fake_graph.session(limits=Limits(in_flight=1)) as session:
         assert await ask(session, 0) == 0
-        service = session.pool.service(Echo, "/echo", None)
-        (client,) = service.clients
-        send = client.send
 
         def refuse(request: object) -> int:
             raise OverflowError("does not fit")
 
-        client.send = refuse
-        for retry in (None, Retry()):
-            with pytest.raises(OverflowError, match="does not fit"):
-                await ask(session, 1, retry=retry)
-        client.send = send
+        with sends(fake_graph, refuse):
+            for retry in (None, Retry()):
+                with pytest.raises(OverflowError, match="does not fit"):
+                    await ask(session, 1, retry=retry)
         assert await ask(session, 2) == 2
         total = session.pool.statistics()
         assert (total.in_flight, total.abandoned, total.failed) == (0, 0, 2)
@@ -64,16 +73,16 @@ async def test_a_queued_send_that_fails_does_not_end_those_behind_it(
     fake_graph.serve(Echo, "/echo", echo)
     async with fake_graph.session(limits=Limits(in_flight=1)) as session:
         assert await ask(session, 0) == 0
-        (client,) = session.pool.service(Echo, "/echo", None).clients
-        send = client.send
+        send = the_client(fake_graph).send
 
         def refuse_odd(request: Any) -> int:
             if request.value % 2:
                 raise OverflowError("odd")
             return send(request)
 
-        client.send = refuse_odd
-        ended = await asyncio.gather(*(ask(session, n) for n in range(10)), return_exceptions=True)
+        with sends(fake_graph, refuse_odd):
+            calls = [ask(session, n) for n in range(10)]
+            ended = await asyncio.gather(*calls, return_exceptions=True)
         assert [type(e) if isinstance(e, Exception) else e for e in ended] == [
             n if n % 2 == 0 else OverflowError for n in range(10)
         ]
@@ -90,6 +99,45 @@ async def test_a_lease_taken_in_the_turn_of_an_error_is_not_lost(fake_graph: Fak
         await first
         assert await tasks[1] == 2
         assert await ask(session, 3) == 3
+
+
+@pytest.mark.parametrize("turns", range(3))
+async def test_a_call_that_was_cancelled_is_not_sent_when_its_server_comes(
+    fake_graph: FakeGraph, turns: int
+) -> None:
+    async with fake_graph.session() as session:
+        task = session.start(Echo, "/echo", Echo.Request(1))
+        for _ in range(turns):
+            await asyncio.sleep(0)
+        task.cancel()
+        server = fake_graph.serve(Echo, "/echo", echo)
+        with pytest.raises(asyncio.CancelledError):
+            await task
+        assert await ask(session, 2) == 2
+    assert [request.value for request in server.received] == [2]
+
+
+async def test_a_call_that_was_cancelled_in_the_turn_of_a_free_place_is_not_sent(
+    fake_graph: FakeGraph,
+) -> None:
+    server = fake_graph.serve(Echo, "/echo", echo)
+    async with fake_graph.session(limits=Limits(in_flight=1)) as session:
+        await ask(session, 0)
+        with fake_graph.drop_requests():
+            out = session.start(Echo, "/echo", Echo.Request(1))
+        first = session.start(Echo, "/echo", Echo.Request(2))
+        port = the_client(fake_graph)
+        port.deliver(port.sent[-1], Echo.Response(1))
+        # The assignment is already scheduled, ahead of the first step of this task.
+        second = session.start(Echo, "/echo", Echo.Request(3))
+        first.cancel()
+        third = session.start(Echo, "/echo", Echo.Request(4))
+        third.cancel()
+        assert [task.value for task in await asyncio.gather(out, second)] == [1, 3]
+        await asyncio.wait([first, third])
+        assert first.cancelled()
+        assert third.cancelled()
+    assert [request.value for request in server.received] == [0, 3]
 
 
 async def test_a_message_changed_after_start_was_sent_as_it_was(fake_graph: FakeGraph) -> None:
@@ -165,9 +213,10 @@ async def test_a_client_destroyed_by_other_means_is_replaced(fake_graph: FakeGra
     fake_graph.serve(Echo, "/echo", echo)
     async with fake_graph.session() as session:
         assert await ask(session, 0) == 0
-        (client,) = session.pool.service(Echo, "/echo", None).clients
-        client.send = raise_destroyed  # type: ignore[assignment]
-        with pytest.raises(ContextShutdown, match="/echo: the client was destroyed"):
+        with (
+            sends(fake_graph, raise_destroyed),
+            pytest.raises(ContextShutdown, match="/echo: the client was destroyed"),
+        ):
             await ask(session, 1)
         assert await ask(session, 2) == 2
         total = session.pool.statistics()
@@ -303,7 +352,7 @@ async def test_a_call_that_outlives_its_lease_keeps_its_place(fake_graph: FakeGr
         assert await ask(session, 3) == 3
 
 
-async def test_a_leased_call_woken_in_the_turn_of_the_end_is_not_sent(
+async def test_a_leased_call_whose_place_comes_in_the_turn_of_the_end_is_not_sent(
     fake_graph: FakeGraph,
 ) -> None:
     fake_graph.serve(Echo, "/echo", echo)
@@ -316,9 +365,8 @@ async def test_a_leased_call_woken_in_the_turn_of_the_end_is_not_sent(
             await leased.call(Echo.Request(1), timeout=0.0)
         waiting = asyncio.create_task(leased.call(Echo.Request(2), timeout=None))
         await asyncio.sleep(0)
+        # The late response gives the place back, and the next turn would send the second request.
         client.deliver(1, Echo.Response())
-        # The late response has given the place back, and this dispatch grants it.
-        fake_graph.changed()
         session.pool.end(lambda: SessionClosed("the session is closed"))
         with pytest.raises(SessionClosed):
             await asyncio.wait_for(waiting, LIMIT)

@@ -1,0 +1,306 @@
+"""Who goes next: one function decides it for all callers of a service."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Protocol
+
+from rosasync._client.clients import Clients
+from rosasync._core.ports import PortDestroyed
+from rosasync.errors import ContextShutdown
+
+if TYPE_CHECKING:
+    from rosasync._client.call import Call
+    from rosasync._client.call_errors import CallErrors
+    from rosasync._client.client import Client
+    from rosasync._client.counts import Counts
+    from rosasync._client.graph_watch import GraphWatch
+    from rosasync._client.sent import Sent
+    from rosasync._core.aio import Deadlines
+    from rosasync._core.ports import NodePort, Service
+    from rosasync.options import Limits
+    from rosasync.tracing import ClientTracing
+
+__all__ = ["Dispatch", "LeaseWaiter", "Waiter"]
+
+
+class Waiter(Protocol):
+    """A caller in the queue: a `Call` or a `LeaseWaiter`."""
+
+    future: asyncio.Future[Any]
+
+    @property
+    def gone(self) -> bool:
+        """Whether nothing may be sent for the caller any more."""
+
+    def start(self, client: Client, now: float) -> None:
+        """Go on with this client, which has a free place."""
+
+
+class LeaseWaiter:
+    """A caller that waits for a lease. Its future receives the client."""
+
+    __slots__ = ("future",)
+
+    def __init__(self, future: asyncio.Future[Client]) -> None:
+        self.future = future
+
+    @property
+    def gone(self) -> bool:
+        """Whether the caller has left."""
+        return self.future.done()
+
+    def start(self, client: Client, now: float) -> None:
+        """Take a place of this client."""
+        client.window.lease()
+        self.future.set_result(client)
+
+
+class Dispatch:
+    """The callers of one service that wait, and the one function that lets them go: `assign`.
+
+    It runs when something was added or came free, and from nowhere else: in the next turn of the
+    loop after a caller or a request to be sent again was added, or a place came free (`schedule`);
+    and when the graph may have changed, because a client may be matched now.
+
+    In the next turn, and not at once: by then the callers that were cancelled in this turn are
+    done, and no caller is resumed in the middle of another one's work.
+
+    Attributes:
+        clients: the clients of the service.
+        queue: the callers that wait for a place, in their order.
+        resends: the calls that wait to be sent again, in the order in which that became due.
+        leased: the calls that wait for their leased client: for its match, or for the place of the
+            lease while an abandoned request takes it.
+    """
+
+    def __init__(
+        self,
+        service: Service,
+        node: NodePort,
+        limits: Limits,
+        watch: GraphWatch,
+        errors: CallErrors,
+        counts: Counts,
+        traces: ClientTracing,
+        deadlines: Deadlines,
+    ) -> None:
+        self.clients = Clients(service, node, limits, watch, errors, counts, self)
+        self.queue: dict[Waiter, None] = {}
+        self.resends: dict[Call, None] = {}
+        self.leased: dict[Call, None] = {}
+        # Each caller that waits for a match, with the client to be matched: None for any client.
+        self._match_waiters: dict[asyncio.Future[None], Client | None] = {}
+        self._limits = limits
+        self._watch = watch
+        self._errors = errors
+        self._traces = traces
+        self._deadlines = deadlines
+        self._loop = asyncio.get_running_loop()
+        self._scheduled = False
+        self._ended = False
+
+    @property
+    def awaits_match(self) -> bool:
+        """Whether callers wait for a client to be matched, and not only for a place."""
+        generation = self._watch.generation
+        for client in self._match_waiters.values():
+            if client is None or client.matched_generation != generation:
+                return True
+        for call in (*self.resends, *self.leased):
+            if (call.lease or call.client).matched_generation != generation:
+                return True
+        return bool(self.queue) and self.clients.awaits_match
+
+    def callers_wait(self) -> bool:
+        """Return whether callers wait for a place or a match, or calls to be sent again."""
+        return bool(self.queue or self.resends or self.leased or self._match_waiters)
+
+    def next_resend(self, client: Client) -> Sent | None:
+        """Return the newest attempt of the first call that waits to be sent again by a client."""
+        return next((call.newest for call in self.resends if call.client is client), None)
+
+    # What is added, and what comes free.
+
+    def enqueue(self, waiter: Waiter) -> None:
+        """Add a caller to the end of the queue.
+
+        Raises:
+            PoolFull: the queue is full.
+            Exception: there is no client, and none can be created.
+        """
+        waiting = len(self.queue)
+        self.clients.grow(waiting + 1)
+        # Callers for whom there is a free place wait for a match or a turn, so they do not count.
+        free = self.clients.free
+        if waiting >= self._limits.waiting + free:
+            raise self._errors.pool_full(waiting, self._limits.waiting)
+        self.queue[waiter] = None
+        if free:
+            self.schedule()
+        else:
+            self._set_timers()
+
+    def start_leased(self, call: Call, now: float) -> None:
+        """Start a call on a lease now, or when its client is matched and has its place.
+
+        Raises:
+            ContextShutdown: the client was destroyed, or the node is down.
+        """
+        assert call.lease is not None
+        if self._is_lease_ready(call.lease):
+            call.start(call.lease, now)
+            return
+        self.leased[call] = None
+        if call.trace is not None:
+            matched = call.lease.matched_generation == self._watch.generation
+            self._traces.wait(call.trace, not matched)
+        self._watch.poll_soon()
+        self._set_timers()
+
+    def send_again(self, call: Call) -> None:
+        """Send a call again as soon as there are a server and a place."""
+        self.resends[call] = None
+        self.schedule()
+
+    def remove(self, call: Call) -> None:
+        """Remove a call wherever it waits, because its caller leaves."""
+        self.queue.pop(call, None)
+        self.resends.pop(call, None)
+        self.leased.pop(call, None)
+
+    async def wait_for_match(self, client: Client | None, deadline: float | None) -> None:
+        """Wait until a client is matched: any client if it is None.
+
+        Raises:
+            Expired: the deadline passed.
+        """
+        waiter: asyncio.Future[None] = self._loop.create_future()
+        self._match_waiters[waiter] = client
+        self._watch.poll_soon()
+        try:
+            await self._deadlines.wait(waiter, deadline)
+        finally:
+            del self._match_waiters[waiter]
+
+    def on_places(self) -> None:
+        """Schedule an assignment if callers wait: places may have come free."""
+        if self.queue or self.resends or self.leased:
+            self.schedule()
+
+    def on_matched(self) -> None:
+        """Report to the traced calls that a client is matched: from now on they are queued."""
+        self._traces.on_matched()
+
+    def drop(self, client: Client) -> None:
+        """Remove a client that other code has destroyed."""
+        self.clients.drop(client)
+
+    def schedule(self) -> None:
+        """Assign in the next turn of the loop."""
+        if not self._scheduled and not self._loop.is_closed():
+            self._scheduled = True
+            self._loop.call_soon(self._run)
+
+    def end(self, ending: Callable[[], Exception]) -> None:
+        """Fail every waiting caller, and assign nothing any more."""
+        self._ended = True
+        self._fail_waiting(ending)
+
+    # The decision.
+
+    def assign(self) -> None:
+        """Decide who goes next, and let them go.
+
+        1. Calls that are sent again, because their callers came before those in the queue.
+        2. Calls on a lease: they have their place, or are the next to have it.
+        3. The queue, first come, first served, while there are matched clients with free places.
+        """
+        if self._ended:
+            return
+        now = self._loop.time()
+        self._wake_match_waiters()
+        for call in tuple(self.resends):
+            if call.gone or self._may_send_again(call):
+                del self.resends[call]
+                if not call.gone:
+                    call.send_again(now)
+        for call in tuple(self.leased):
+            self._assign_lease(call, now)
+        while self.queue:
+            waiter = next(iter(self.queue))
+            client = None if waiter.gone else self.clients.choose()
+            if client is None and not waiter.gone:
+                break
+            del self.queue[waiter]
+            if client is not None:
+                waiter.start(client, now)
+        self._replace_clients()
+
+    def _run(self) -> None:
+        self._scheduled = False
+        with self._watch.reports_shutdown():
+            self.assign()
+            if self.awaits_match:
+                self._watch.poll_soon()
+            if self.callers_wait():
+                self._set_timers()
+
+    def _set_timers(self) -> None:
+        """Let the clients give up the places of lost requests, because a caller waits."""
+        for client in self.clients:
+            client.set_timer()
+
+    def _may_send_again(self, call: Call) -> bool:
+        client = call.client
+        if not client.window.may_send_again(call.newest, call.lease is not None):
+            return False
+        try:
+            # `ready` as well: a server may vanish before the graph changes.
+            return client.ready() and self.clients.match(client)
+        except PortDestroyed:
+            self.clients.drop(client)
+        except Exception as error:
+            call.fail_send(error)
+        return False
+
+    def _assign_lease(self, call: Call, now: float) -> None:
+        assert call.lease is not None
+        try:
+            if call.gone or self._is_lease_ready(call.lease):
+                del self.leased[call]
+                if not call.gone:
+                    call.start(call.lease, now)
+        except ContextShutdown as error:
+            call.future.set_exception(error)
+
+    def _is_lease_ready(self, lease: Client) -> bool:
+        if lease.closed:
+            raise self._errors.client_destroyed()
+        return lease.window.free >= 0 and self.clients.match(lease)
+
+    def _wake_match_waiters(self) -> None:
+        for waiter, client in self._match_waiters.items():
+            if not waiter.done() and (
+                self.clients.match_any() if client is None else self.clients.match(client)
+            ):
+                waiter.set_result(None)
+
+    def _replace_clients(self) -> None:
+        """Create clients for the waiting callers, if something else has destroyed some.
+
+        If that fails, all waiting callers get the error.
+        """
+        try:
+            self.clients.grow(len(self.queue) or bool(self._match_waiters))
+        except Exception as error:
+            failure = error
+            self._fail_waiting(lambda: failure)
+
+    def _fail_waiting(self, error: Callable[[], Exception]) -> None:
+        waiting = [waiter.future for waiter in self.queue]
+        waiting += [call.future for call in self.leased]
+        for future in (*waiting, *self._match_waiters):
+            if not future.done():
+                future.set_exception(error())

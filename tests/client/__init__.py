@@ -1,0 +1,1 @@
+"""The client side: a test module for each module of `rosasync._client`."""
