@@ -11,6 +11,7 @@ from rosasync.testing.graph import FakeClient, FakeGraph, FakeNode, FakeServer, 
 from rosasync.testing.recording import RecordedCall, Recording
 from rosasync.testing.ros_graph import Graph
 from rosasync.testing.stub import StubCall, StubServer
+from rosasync.testing.stub_action import StubActionServer, StubGoal
 
 __all__ = [
     "FakeClient",
@@ -21,7 +22,9 @@ __all__ = [
     "Graph",
     "RecordedCall",
     "Recording",
+    "StubActionServer",
     "StubCall",
+    "StubGoal",
     "StubServer",
     "VirtualClock",
 ]

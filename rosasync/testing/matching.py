@@ -44,13 +44,13 @@ def check_fields(message_type: type[Any], fields: Mapping[str, Any]) -> None:
                     check_fields(field.message_type, nested)
 
 
-def describe(requests: Sequence[Mapping[str, Any]], lost: int = 0) -> str:
-    """List requests, one in a line, and say how many further ones were lost."""
+def describe(requests: Sequence[Mapping[str, Any]], lost: int = 0, noun: str = "request") -> str:
+    """List requests, or goals, one in a line, and say how many further ones were lost."""
     further = f" ({count(lost, 'request')} lost on the way)" if lost else ""
     if not requests:
-        return f"it received no request{further}"
+        return f"it received no {noun}{further}"
     lines = [f"  {number}. {fields}" for number, fields in enumerate(requests, 1)]
-    return "\n".join([f"it received {count(len(requests), 'request')}{further}:", *lines])
+    return "\n".join([f"it received {count(len(requests), noun)}{further}:", *lines])
 
 
 def difference(expected: Any, actual: Any) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import inspect
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Literal, Self, overload
 
@@ -13,9 +13,21 @@ from rosasync.errors import UsageError
 from rosasync.testing.graph import FakeGraph
 from rosasync.testing.hooks import GraphSession, Hooks
 from rosasync.testing.stub import STUB, Answer, StubServer
-from rosasync.typing import RequestT, ResponseT, ServiceType
+from rosasync.testing.stub_action import STUB as STUB_ACTION
+from rosasync.testing.stub_action import GoalAnswer, StubActionServer
+from rosasync.typing import (
+    ActionType,
+    FeedbackT,
+    GoalT,
+    RequestT,
+    ResponseT,
+    ResultT,
+    ServiceType,
+)
 
 if TYPE_CHECKING:
+    from rosasync._actions.goal_runner import GoalHandler
+    from rosasync._actions.server import ActionServer
     from rosasync._core.ports import Service
     from rosasync._server.handlers import Handler
     from rosasync._server.server import ServiceServer
@@ -54,6 +66,7 @@ class Graph:
         kind: as given.
         strict: as given; may be changed until the end.
         servers: the servers, in the order of their creation.
+        action_servers: the action servers, in the order of their creation.
         unexpected: what the code under test called without an answer for it, as sentences.
     """
 
@@ -63,6 +76,7 @@ class Graph:
         self.kind = kind
         self.strict = strict
         self.servers: list[StubServer[Any, Any]] = []
+        self.action_servers: list[StubActionServer[Any, Any, Any]] = []
         self.unexpected: list[str] = []
         self._fake = FakeGraph() if kind == "memory" else None
         self._hooks = Hooks()
@@ -93,6 +107,8 @@ class Graph:
         Raises:
             AssertionError: the graph is strict, and something was wrong.
         """
+        for action_server in self.action_servers:
+            await action_server.vanish()
         for server in self.servers:
             await server.vanish()
         await self._open().aclose()
@@ -198,6 +214,110 @@ class Graph:
         server = self._serve(srv_type, srv_name, STUB, optional, options)
         return server.answer(*answers) if answers else server
 
+    @overload
+    def serve_action(
+        self,
+        action_type: ActionType[GoalT, ResultT, FeedbackT],
+        action_name: str,
+        handler: GoalHandler[GoalT, FeedbackT, ResultT],
+        *,
+        optional: bool = False,
+        **options: Any,
+    ) -> StubActionServer[GoalT, ResultT, FeedbackT]: ...
+
+    @overload
+    def serve_action(
+        self,
+        action_type: str,
+        action_name: str,
+        handler: GoalHandler[Any, Any, Any],
+        *,
+        optional: bool = False,
+        **options: Any,
+    ) -> StubActionServer[Any, Any, Any]: ...
+
+    def serve_action(
+        self,
+        action_type: Any,
+        action_name: str,
+        handler: Any,
+        *,
+        optional: bool = False,
+        **options: Any,
+    ) -> StubActionServer[Any, Any, Any]:
+        """Serve an action with a handler.
+
+        Args:
+            action_type: an action class or its name.
+            action_name: the action's name.
+            handler: ``handler(goal)``, async, as for `rosasync.Session.serve_action`.
+            optional: whether a strict graph accepts that it never gets a goal.
+            options: those of `rosasync.Session.serve_action`.
+
+        Raises:
+            TypeError, ValueError, InvalidServiceName: as `rosasync.Session.serve_action`.
+            UsageError: the graph is not open, or this runs outside its loop.
+        """
+        return self._serve_action(action_type, action_name, handler, optional, options)
+
+    @overload
+    def stub_action(
+        self,
+        action_type: ActionType[GoalT, ResultT, FeedbackT],
+        action_name: str,
+        *answers: GoalAnswer,
+        feedback: Iterable[FeedbackT | Mapping[str, Any]] = (),
+        delay: float = 0.0,
+        optional: bool = False,
+        **options: Any,
+    ) -> StubActionServer[GoalT, ResultT, FeedbackT]: ...
+
+    @overload
+    def stub_action(
+        self,
+        action_type: str,
+        action_name: str,
+        *answers: GoalAnswer,
+        feedback: Iterable[Any] = (),
+        delay: float = 0.0,
+        optional: bool = False,
+        **options: Any,
+    ) -> StubActionServer[Any, Any, Any]: ...
+
+    def stub_action(
+        self,
+        action_type: Any,
+        action_name: str,
+        *answers: GoalAnswer,
+        feedback: Iterable[Any] = (),
+        delay: float = 0.0,
+        optional: bool = False,
+        **options: Any,
+    ) -> StubActionServer[Any, Any, Any]:
+        """Serve an action with fixed answers; further ones by `StubActionServer.answer`.
+
+        ::
+
+            drive = graph.stub_action(Drive, "/drive", {"driven": 2.0}, feedback=[{"driven": 1.0}])
+
+        Args:
+            action_type: an action class or its name.
+            action_name: the action's name.
+            answers: the answers to all goals, as for `StubActionServer.answer`.
+            feedback: the feedback of each goal, messages or mappings.
+            delay: seconds before each feedback message, and before the end of a goal.
+            optional: whether a strict graph accepts that it never gets a goal.
+            options: those of `rosasync.Session.serve_action`; ``concurrency`` is 100 if left out.
+
+        Raises:
+            TypeError, ValueError, InvalidServiceName: an argument does not fit.
+            UsageError: the graph is not open, or this runs outside its loop.
+        """
+        server = self._serve_action(action_type, action_name, STUB_ACTION, optional, options)
+        if answers:
+            server.answer(*answers, feedback=feedback, delay=delay)
+        return server
+
     def replay(
         self, recording: Recording, *, optional: bool = False
     ) -> dict[str, StubServer[Any, Any]]:
@@ -241,6 +361,11 @@ class Graph:
             for server in self.servers
             if not (server.calls or server.lost_requests or server.optional)
         ]
+        uncalled += [
+            f"{action_server.action_name} never got a goal"
+            for action_server in self.action_servers
+            if not (action_server.goals or action_server.lost_requests or action_server.optional)
+        ]
         if problems := [*dict.fromkeys(self.unexpected), *uncalled]:
             raise AssertionError("\n".join(["the graph is strict, and", *problems]))
 
@@ -261,6 +386,28 @@ class Graph:
         self.servers.append(server)
         return server
 
+    def _serve_action(
+        self,
+        action_type: Any,
+        action_name: str,
+        handler: Any,
+        optional: bool,
+        options: dict[str, Any],
+    ) -> StubActionServer[Any, Any, Any]:
+        self._open()
+        _check_loop(action_name)
+        server = StubActionServer[Any, Any, Any](
+            action_type,
+            action_name,
+            handler,
+            options,
+            optional,
+            self._open_action_server,
+            self.unexpected.append,
+        )
+        self.action_servers.append(server)
+        return server
+
     def _open(self) -> Session:
         if self._stubs is None:
             raise UsageError("the graph is not open: use `async with Graph() as graph:`")
@@ -275,9 +422,24 @@ class Graph:
         finally:
             self._hooks.wrap_service = None
 
+    def _open_action_server(
+        self, wrap: Callable[..., Any], *args: Any, **options: Any
+    ) -> ActionServer[Any, Any, Any]:
+        session = self._open()
+        self._hooks.wrap_service = wrap
+        try:
+            return session.core.serve_action(session.serve, *args, **options)
+        finally:
+            self._hooks.wrap_service = None
+
     def _missing(self, service: Service) -> None:
         name, kind, _ = service.key
-        if all(server.srv_name != name for server in self.servers):
+        known = {server.srv_name for server in self.servers}
+        action, _, part = name.partition("/_action/")
+        if part:
+            known.update(server.action_name for server in self.action_servers)
+            name, kind = action, kind.rpartition("_")[0]
+        if name not in known:
             self.unexpected.append(f"{name} ({kind}) was called, and has no server")
 
 

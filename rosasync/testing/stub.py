@@ -6,13 +6,13 @@ import asyncio
 import logging
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Generic, Self, TypeAlias
 
 from rosasync._ros.messages import to_dict, to_message
 from rosasync._ros.types import service_type
 from rosasync.testing.faults import Faults, FaultyService, StubCall, set_in_block
 from rosasync.testing.matching import check_fields, count, describe, difference, matches
+from rosasync.testing.rules import Match, Rule
 from rosasync.typing import RequestT, ResponseT
 
 if TYPE_CHECKING:
@@ -25,29 +25,7 @@ Answer: TypeAlias = Any
 """A response message, a mapping of its fields, an exception that the handler raises, or None for no
 answer at all."""
 
-Match: TypeAlias = Mapping[str, Any] | Callable[[Any], bool] | None
-"""Which requests: a mapping of the fields that count, a function of the request, None for all."""
-
 logger = logging.getLogger("rosasync")
-
-
-@dataclass
-class _Rule:
-    """Answers to the requests that match. A single one is repeated, several are given in turn."""
-
-    match: Match
-    answers: list[Answer]
-    repeated: bool
-
-    def fits(self, request: Any) -> bool:
-        if not self.answers:
-            return False
-        if callable(self.match):
-            return bool(self.match(request))
-        return self.match is None or matches(self.match, to_dict(request))
-
-    def take(self) -> Answer:
-        return self.answers[0] if self.repeated else self.answers.pop(0)
 
 
 class StubServer(Generic[RequestT, ResponseT]):
@@ -79,7 +57,7 @@ class StubServer(Generic[RequestT, ResponseT]):
         self._options = options
         self._open_server = open_server
         self._on_unexpected = on_unexpected
-        self._rules: list[_Rule] = []
+        self._rules: list[Rule[Answer]] = []
         self._faults = Faults()
         self._changed = asyncio.Event()
         self._server = self._open()
@@ -141,7 +119,7 @@ class StubServer(Generic[RequestT, ResponseT]):
         if isinstance(match, Mapping):
             check_fields(self._type.Request, match)
         prepared = [self._prepare(answer) for answer in answers]
-        self._rules.append(_Rule(match, prepared, repeated=len(prepared) == 1))
+        self._rules.append(Rule.of(match, prepared))
         return self
 
     def _prepare(self, answer: Answer) -> Answer:
