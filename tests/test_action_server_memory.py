@@ -118,3 +118,19 @@ async def test_many_goals_leave_nothing_behind(fake_graph: FakeGraph) -> None:
             tracemalloc.stop()
         assert server.statistics().succeeded == 2400
         assert after - before < 50_000
+
+
+async def test_the_status_of_many_goals_is_published_less_often(fake_graph: FakeGraph) -> None:
+    async with fake_graph.session() as session:
+        server = session.serve_action(Fibonacci, "/fib", at_once)
+        (status,) = (p for p in fake_graph.publishers if p.topic_name.endswith("status"))
+        for _ in range(99):
+            await run(session, goal_of())
+        assert len(status.published) >= 99
+        before = len(status.published)
+        for _ in range(20):
+            await run(session, goal_of())
+        assert len(status.published) - before < 20
+        await server.aclose()
+        last = status.published[-1].status_list
+        assert [each.status for each in last] == [GoalStatus.SUCCEEDED] * 119

@@ -41,6 +41,8 @@ logger = logging.getLogger("rosasync")
 
 CLOSE_TIMEOUT = 5.0
 """Seconds to wait for cancelled handlers to end when a server is closed."""
+CANCEL_TIMEOUT = 1.0
+"""Seconds to wait for them if the server has ended at once."""
 
 ServeService: TypeAlias = "Callable[..., ServiceServer[Any, Any]]"
 """Serves a service of the action: ``(srv_type, srv_name, handler)``."""
@@ -60,19 +62,22 @@ class ActionServer(Generic[GoalT, ResultT, FeedbackT]):
         action: Action,
         handler: GoalHandler[GoalT, FeedbackT, ResultT],
         *,
-        on_goal: GoalHook[GoalT] | None,
-        on_cancel: CancelHook[GoalT, FeedbackT] | None,
-        on_busy: OnBusy,
-        concurrency: int,
-        backlog: int,
-        result_timeout: float | None,
-        on_error: GoalErrorHook[GoalT, FeedbackT, ResultT] | None,
+        on_goal: GoalHook[GoalT] | None = None,
+        on_cancel: CancelHook[GoalT, FeedbackT] | None = None,
+        on_busy: OnBusy = "queue",
+        concurrency: int = 1,
+        backlog: int = 10,
+        result_timeout: float | None = 900.0,
+        on_error: GoalErrorHook[GoalT, FeedbackT, ResultT] | None = None,
         on_end: Callable[[ActionServer[GoalT, ResultT, FeedbackT]], object],
+        on_accepted: Callable[[ServerGoal[GoalT, FeedbackT]], object] | None = None,
     ) -> None:
         self._loop = asyncio.get_running_loop()
         self._node = node
         self._action = action
         self._on_end = on_end
+        # For the stubs of `rosasync.testing`.
+        self._on_accepted = on_accepted
         self._tasks = HandlerTasks()
         self._goals = ServerGoals(
             action.name,
@@ -186,6 +191,7 @@ class ActionServer(Generic[GoalT, ResultT, FeedbackT]):
                 f"{self.action_name}: a server can only be closed in the loop that serves it"
             )
         if self._ending is not None:
+            await self._tasks.wait(self._loop.time() + CANCEL_TIMEOUT)
             return
         # First, because an eager task collects the handlers to wait for as it is created.
         self.exclude_caller()
@@ -242,7 +248,10 @@ class ActionServer(Generic[GoalT, ResultT, FeedbackT]):
     # What the parts call.
 
     def _make_goal(self, record: GoalRecord, request: Any) -> ServerGoal[Any, Any]:
-        return ServerGoal(self, record, request, self._publish_feedback)
+        goal = ServerGoal[Any, Any](self, record, request, self._publish_feedback)
+        if self._on_accepted is not None:
+            self._on_accepted(goal)
+        return goal
 
     def _make_result(self, value: Any) -> Any:
         """Make a result that does not change any more, of what a handler returned."""
@@ -252,8 +261,8 @@ class ActionServer(Generic[GoalT, ResultT, FeedbackT]):
                 "message or a mapping of its fields"
             )
         result = self._node.make_message(self._action.action_type.Result, value)
-        # It is sent to whoever asks for it, and the handler may use its message again.
-        return deepcopy(result) if result is value else result
+        # It is sent to whoever asks for it, and the handler may use its messages again.
+        return deepcopy(result)
 
     def _publish_feedback(self, goal_id: bytes, value: Any) -> None:
         if self._ending is not None:
@@ -297,6 +306,7 @@ class ActionServer(Generic[GoalT, ResultT, FeedbackT]):
                 timeout,
             )
         self._runner.abort_all()
+        self._goals.flush()
         # Each waits until the clients have received its last responses.
         await asyncio.gather(*(service.aclose(CLOSE_TIMEOUT) for service in self._services))
         self.end(functools.partial(SessionClosed, f"{self.action_name}: the server is closed"))

@@ -19,6 +19,15 @@ __all__ = ["ServerGoals"]
 
 logger = logging.getLogger("rosasync")
 
+FEW = 100
+"""Goals up to which the status is published in the next turn of the loop. A message lists every
+goal that has not expired, so it costs more and more: with more goals, it waits for further changes.
+"""
+DELAY = 20e-6
+"""Seconds by which each goal that is listed then delays the message."""
+MAX_DELAY = 0.05
+"""Maximum number of seconds of this delay."""
+
 
 class ServerGoals:
     """The goals of a server, their status on the topic, and their results for those who ask.
@@ -45,9 +54,9 @@ class ServerGoals:
         self._publish_status = publish_status
         self._response_type = response_type
         self._statuses = StatusList()
-        # Whether `_publish` is scheduled. One message for all changes of a turn: it lists every
-        # goal, and its subscribers keep the last one only.
-        self._publishing = False
+        # Set while `_publish` is scheduled. One message serves all changes until then: it lists
+        # every goal, and its subscribers keep the last message only.
+        self._publishing: asyncio.Handle | None = None
         # A goal is in `_askers` until it ends, and then in `_responses` until it expires.
         self._askers: dict[bytes, list[ServiceCall[Any, Any]]] = {}
         self._responses: dict[bytes, Any] = {}
@@ -134,22 +143,33 @@ class ServerGoals:
             call.response.status = int(GoalStatus.UNKNOWN)
             self._respond(call, call.response)
 
+    def flush(self) -> None:
+        """Publish the status at once, if it has changed since it was published."""
+        if self._publishing is not None:
+            self._publishing.cancel()
+            self._publish()
+
     def close(self) -> None:
         """Stop publishing, and let nothing expire any more; idempotent."""
         self._closed = True
-        if self._timer is not None:
-            self._timer.cancel()
+        for handle in (self._timer, self._publishing):
+            if handle is not None:
+                handle.cancel()
 
     def _show(self, record: GoalRecord) -> None:
         self._statuses.set(record.id, record.stamp, record.status)
-        if not self._publishing:
-            self._publishing = True
-            self._loop.call_soon(self._publish)
+        if self._publishing is not None or self._closed:
+            return
+        listed = len(self._statuses)
+        if listed < FEW:
+            self._publishing = self._loop.call_soon(self._publish)
+        else:
+            delay = min(listed * DELAY, MAX_DELAY)
+            self._publishing = self._loop.call_later(delay, self._publish)
 
     def _publish(self) -> None:
-        self._publishing = False
-        if not self._closed:
-            self._publish_status(self._statuses.encode())
+        self._publishing = None
+        self._publish_status(self._statuses.encode())
 
     def _respond(self, call: ServiceCall[Any, Any], response: Any) -> None:
         # One that cannot be answered must not keep the others from it.

@@ -28,6 +28,9 @@ class StatusList:
     def __init__(self) -> None:
         self._elements: dict[bytes, bytes] = {}
 
+    def __len__(self) -> int:
+        return len(self._elements)
+
     def set(self, goal_id: bytes, stamp: int, status: int) -> None:
         """Add a goal, or change its status.
 

@@ -44,7 +44,6 @@ from rosasync._ros.failures import (
     is_up,
     refusal,
     topic_refusal,
-    uses_node,
 )
 from rosasync._ros.graph import GraphQueries, GraphWaitable
 from rosasync._ros.identities import Identities
@@ -52,7 +51,7 @@ from rosasync._ros.messages import make_message
 from rosasync._ros.shared_memory import check_ports
 from rosasync._ros.topics import Publisher, qos_profile
 from rosasync._ros.types import type_name
-from rosasync.errors import RosasyncError, UsageError
+from rosasync.errors import ContextShutdown, RosasyncError, UsageError
 from rosasync.options import SessionOptions
 
 if TYPE_CHECKING:
@@ -157,8 +156,10 @@ class RosNode:
 
     def now(self) -> int:
         """Return the time of the node's clock, in ns."""
-        with uses_node(self._node):
+        try:
             return int(self._node.get_clock().now().nanoseconds)
+        except RclpyError as error:
+            raise ContextShutdown() from error
 
     def describe(self, srv_type: Any, srv_name: str, qos: Any) -> Service:
         """Check and resolve a service."""
