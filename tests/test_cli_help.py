@@ -18,7 +18,7 @@ COMMANDS = [
     *("call", "list", "type", "find", "show", "info", "nodes"),
     *("serve", "watch", "bench", "ping", "why", "doctor", "profile", "run", "demo"),
 ]
-GROUPS = ["param", "lifecycle"]
+GROUPS = ["action", "param", "lifecycle"]
 """The commands that have commands of their own, tested in test_cli_nodes.py."""
 
 UNTIL_INTERRUPTED = {"serve", "watch", "demo --serve"}

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from rosasync._cli import lifecycle, param
+from rosasync._cli import action, lifecycle, param
 from rosasync._cli.bench import bench
 from rosasync._cli.call import call
 from rosasync._cli.demo import demo
@@ -34,7 +34,7 @@ _UsageError: Any = typer.BadParameter.__mro__[1]
 
 app = typer.Typer(
     name="rosasync",
-    help="ROS 2 services from the command line.",
+    help="ROS 2 services and actions from the command line.",
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
@@ -55,6 +55,7 @@ app.command()(doctor)
 app.command()(profile)
 app.command("run", context_settings={"allow_interspersed_args": False})(run_fresh)
 app.command()(demo)
+app.add_typer(action.app, name="action")
 app.add_typer(param.app, name="param")
 app.add_typer(lifecycle.app, name="lifecycle")
 

@@ -32,6 +32,7 @@ class CliError(Exception):
 _CODES: tuple[tuple[type[Exception], Code], ...] = (
     (rosasync.ServiceUnavailable, Code.NO_SERVER),
     (rosasync.ResponseTimeout, Code.TIMED_OUT),
+    (rosasync.GoalTimeout, Code.TIMED_OUT),
     (rosasync.ServerGone, Code.SERVER_GONE),
     (rosasync.InvalidServiceName, Code.USAGE),
 )
@@ -44,6 +45,13 @@ _ADVICE: tuple[tuple[type[Exception], str], ...] = (
     (rosasync.InvalidServiceName, "Try: rosasync list"),
 )
 
+_ACTION_ADVICE: tuple[tuple[type[Exception], str], ...] = (
+    (rosasync.ServiceUnavailable, "Try: rosasync action info {name}"),
+    (rosasync.ServerGone, "Its goals are lost. Send the goal again when it is back"),
+    (rosasync.GoalTimeout, "It is cancelled. Try a longer --accept-timeout"),
+)
+"""The advice for the errors of goals, whose types are those of actions."""
+
 
 def code_of(error: BaseException) -> Code:
     """Return the exit code for an error."""
@@ -55,7 +63,8 @@ def code_of(error: BaseException) -> Code:
 def line_of(error: BaseException) -> str:
     """Return an error as one line that says what to do next."""
     text = " ".join(str(error).split()) or type(error).__name__
-    advice = next((advice for kind, advice in _ADVICE if isinstance(error, kind)), "")
+    table = _ACTION_ADVICE if "/action/" in getattr(error, "srv_type", "") else _ADVICE
+    advice = next((advice for kind, advice in table if isinstance(error, kind)), "")
     if not advice:
         return text
     return join(text, advice.format(name=getattr(error, "srv_name", "")))

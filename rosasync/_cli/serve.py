@@ -26,7 +26,7 @@ from rosasync._cli.run import open_session, run
 from rosasync._cli.streams import OutputError
 from rosasync._ros.fields import field_types
 
-__all__ = ["serve"]
+__all__ = ["load_handler", "serve"]
 
 CLOSE_TIMEOUT = 0.5
 """Seconds for which Ctrl-C lets handlers finish."""
@@ -90,7 +90,7 @@ async def _serve(
     if handler is None:
         answer = _Stub(found, behaviour).answer
     elif behaviour == _Behaviour(None, 0.0, 0.0, 0.0, False):
-        answer = _load(handler)
+        answer = load_handler(handler)
     else:
         raise CliError("--handler answers itself: leave out the options of the stub")
     failure: asyncio.Future[None] = asyncio.get_running_loop().create_future()
@@ -135,8 +135,12 @@ def _printing(
     return printing
 
 
-def _load(handler: str) -> Any:
-    """Import ``module:function``, from the working directory too."""
+def load_handler(handler: str) -> Any:
+    """Import ``module:function``, from the working directory too.
+
+    Raises:
+        CliError: there is no such function.
+    """
     module, _, function = handler.partition(":")
     sys.path.insert(0, os.getcwd())
     try:

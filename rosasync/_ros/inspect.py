@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,9 @@ from rosasync._ros.names import default_qos
 
 __all__ = [
     "Endpoint",
+    "action_endpoints",
+    "action_types",
+    "actions",
     "all_discovered",
     "bridge_reason",
     "client_endpoints",
@@ -46,6 +49,13 @@ PARTICIPANTS = 120
 
 SAFE_DOMAINS = 102
 """The ports of higher domains are also used for other purposes (Linux's ephemeral ports)."""
+
+
+SEND_GOAL = "/_action/send_goal"
+"""How the name of the service ends that accepts the goals of an action."""
+
+GOAL_TYPE = "_SendGoal"
+"""How the type of this service ends."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +100,27 @@ def served_types(node: Node, srv_name: str) -> list[str]:
         return []
     types = {endpoint.srv_type for endpoint in server_endpoints(node, srv_name)}
     return sorted(types - {""})
+
+
+def actions(node: Node) -> dict[str, list[str]]:
+    """Return the types of every action that has a server, by name."""
+    return {
+        name.removesuffix(SEND_GOAL): [kind.removesuffix(GOAL_TYPE) for kind in types]
+        for name, types in services(node).items()
+        if name.endswith(SEND_GOAL)
+    }
+
+
+def action_types(node: Node, name: str) -> list[str]:
+    """Return the types under which the action of a resolved name is served."""
+    return [kind.removesuffix(GOAL_TYPE) for kind in served_types(node, f"{name}{SEND_GOAL}")]
+
+
+def action_endpoints(node: Node, name: str) -> tuple[list[Endpoint], list[Endpoint]]:
+    """Return the servers and the clients of the action of a resolved name."""
+    servers = server_endpoints(node, f"{name}{SEND_GOAL}")
+    clients = client_endpoints(node, f"{name}{SEND_GOAL}")
+    return [_of_action(each) for each in servers], [_of_action(each) for each in clients]
 
 
 def node_names(node: Node) -> list[str]:
@@ -180,6 +211,10 @@ def _described(found: endpoints.Endpoint) -> Endpoint:
         return Endpoint(found.node, found.srv_type, "unknown", None)
     reliability = str(qos.reliability.name).lower()
     return Endpoint(found.node, found.srv_type, reliability, _qos_problem(qos))
+
+
+def _of_action(endpoint: Endpoint) -> Endpoint:
+    return replace(endpoint, srv_type=endpoint.srv_type.removesuffix(GOAL_TYPE))
 
 
 def _qos_problem(qos: QoSProfile) -> str | None:
