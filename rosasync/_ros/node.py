@@ -44,6 +44,7 @@ from rosasync._ros.failures import (
     is_up,
     refusal,
     topic_refusal,
+    uses_node,
 )
 from rosasync._ros.graph import GraphQueries, GraphWaitable
 from rosasync._ros.identities import Identities
