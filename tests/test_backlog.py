@@ -98,6 +98,15 @@ def test_room_for_those_who_are_about_to_pop() -> None:
     assert backlog.put("a2", "a", 1, 0.0, room=1) == ["a1"]
 
 
+def test_time_spent_elsewhere_counts() -> None:
+    backlog = Backlog[str](1000, NO_LIMIT)
+    backlog.put("a1", "a", 1, 10.0, waited=STANDING)
+    backlog.put("a2", "a", 1, 10.0)
+    assert backlog.standing
+    assert drain(backlog, 10.0) == "a2 a1"
+    assert backlog.last_age == pytest.approx(STANDING)
+
+
 def test_it_stands_until_nothing_old_waits() -> None:
     backlog = filled("a1 a2")
     backlog.put("a3", "a", 1, STANDING)

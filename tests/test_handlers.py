@@ -11,6 +11,7 @@ import pytest
 from std_srvs.srv import SetBool
 
 from rosasync import (
+    RosasyncError,
     Session,
     UsageError,
 )
@@ -30,7 +31,7 @@ from tests.support.serving import (
 from tests.support.times import until
 
 if TYPE_CHECKING:
-    pass
+    from rosasync.testing import FakeGraph
 
 
 class TestForms:
@@ -186,9 +187,13 @@ class TestErrors:
 
         hook = async_on_error if asynchronous else on_error
         server = session.serve(ECHO, "/served", handler, on_error=hook)
+        caplog.set_level("DEBUG", "rosasync")
         assert await ask(session, "/served", "text") == "text: not today"
         statistics = server.statistics()
         assert (statistics.failed, statistics.responded, statistics.unanswered) == (1, 1, 0)
+        (record,) = (record for record in caplog.records if record.exc_info)
+        assert record.levelname == "DEBUG"
+        assert "raised an exception, and on_error has answered" in record.message
 
     @pytest.mark.parametrize("answer", [None, "no response"])
     async def test_on_error_does_not_answer(
@@ -218,6 +223,18 @@ class TestErrors:
         task = ask(session, "/served", "text", timeout=None)
         await until(lambda: "worse" in caplog.text)
         assert server.statistics().unanswered == 0
+        await discard(task)
+
+    async def test_on_error_that_is_cancelled_hides_no_error(
+        self, session: Session, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        async def on_error(call: AnyCall, error: Exception) -> Any:
+            raise asyncio.CancelledError
+
+        server = session.serve(ECHO, "/served", lambda call: 1 / 0, on_error=on_error)
+        task = ask(session, "/served", "text", timeout=None)
+        await until(lambda: "ZeroDivisionError" in caplog.text)
+        assert (server.statistics().failed, server.statistics().unanswered) == (1, 0)
         await discard(task)
 
     @pytest.mark.parametrize("wrong", ["text", SetBool.Response(), True])
@@ -278,6 +295,122 @@ class TestErrors:
             f"/served: the handler of {_repr_of(1)} was cancelled, so its client gets no response"
         ]
         await discard(task)
+
+    @pytest.mark.parametrize("hook", [False, True], ids=["handler", "on_error"])
+    async def test_a_task_that_is_cancelled_before_it_begins(
+        self, fake_graph: FakeGraph, caplog: pytest.LogCaptureFixture, hook: bool
+    ) -> None:
+        """Its place in ``concurrency`` comes back, although nothing of it has run."""
+        ran: list[str] = []
+
+        async def answer(call: AnyCall, *error: Exception) -> Any:
+            ran.append(call.request.load_namespace)
+            return echo_of(call.request)
+
+        async with fake_graph.session() as session:
+            if hook:
+                server = session.serve(
+                    ECHO, "/served", lambda call: 1 / 0, concurrency=1, on_error=answer
+                )
+            else:
+                server = session.serve(ECHO, "/served", answer, concurrency=1)
+            on_request = server._on_request
+
+            def deliver(request: Any, header: Any) -> None:
+                before = asyncio.all_tasks()
+                on_request(request, header)
+                if request.load_namespace == "victim":
+                    (task,) = asyncio.all_tasks() - before
+                    task.cancel()
+
+            server._port._deliver = deliver  # type: ignore[attr-defined]
+            victim = ask(session, "/served", "victim", timeout=None)
+            await until(lambda: server.statistics().dropped == 1)
+            assert server.statistics().running == 0
+            assert [await ask(session, "/served", text) for text in "ab"] == ["a", "b"]
+            assert ran == ["a", "b"]
+            assert "/served: the handler of" in caplog.text
+            assert "was cancelled, so its client gets no response" in caplog.text
+            if hook:
+                assert "ZeroDivisionError" in caplog.text
+            await discard(victim)
+
+
+class TestAnswers:
+    @pytest.mark.parametrize("asynchronous", [False, True], ids=["plain", "async"])
+    async def test_a_mapping(self, session: Session, asynchronous: bool) -> None:
+        def handler(call: AnyCall) -> Any:
+            return {"message": call.request.load_namespace}
+
+        async def async_handler(request: Any, response: Any) -> Any:
+            return {"message": request.load_namespace}
+
+        server = session.serve(ECHO, "/served", async_handler if asynchronous else handler)
+        assert await ask(session, "/served", "text") == "text"
+        assert server.statistics().responded == 1
+
+    async def test_respond_takes_a_mapping(self, session: Session) -> None:
+        session.serve(ECHO, "/served", lambda call: call.respond({"message": "mapped"}))
+        assert await ask(session, "/served", "text") == "mapped"
+
+    @pytest.mark.parametrize(
+        ("answer", "error"),
+        [
+            ({"massage": "x"}, "massage"),
+            ({"message": 3}, "message"),
+            ({"success": "yes"}, "success"),
+            (Response(message="\ud800"), ""),
+        ],
+    )
+    async def test_what_cannot_be_sent_does_not_count_as_answered(
+        self, session: Session, caplog: pytest.LogCaptureFixture, answer: Any, error: str
+    ) -> None:
+        calls: list[AnyCall] = []
+        errors: list[Exception] = []
+
+        def handler(call: AnyCall) -> Any:
+            calls.append(call)
+            return answer
+
+        def on_error(call: AnyCall, error: Exception) -> Any:
+            assert not call.responded
+            errors.append(error)
+            return {"message": "instead"} if call.request.load_namespace == "again" else None
+
+        server = session.serve(ECHO, "/served", handler, on_error=on_error)
+        task = ask(session, "/served", "text", timeout=None)
+        await until(lambda: server.statistics().failed == 1)
+        assert not calls[0].responded
+        statistics = server.statistics()
+        assert (statistics.responded, statistics.unanswered) == (0, 0)
+        assert error in str(errors[0])
+        assert error in caplog.text
+        assert await ask(session, "/served", "again") == "instead"
+        assert server.statistics().responded == 1
+        await discard(task)
+
+    async def test_a_response_that_the_middleware_refuses(
+        self, fake_graph: FakeGraph, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        async with fake_graph.session() as session:
+            server = session.serve(
+                ECHO,
+                "/served",
+                echo_call,
+                on_error=lambda call, error: {"message": str(error)},
+            )
+            send = server._port.send
+
+            def refuse(header: Any, response: Any) -> None:
+                if response.message == "text":
+                    raise RosasyncError("too large")
+                send(header, response)
+
+            server._port.send = refuse  # type: ignore[method-assign]
+            assert await ask(session, "/served", "text") == "too large"
+            statistics = server.statistics()
+            assert (statistics.failed, statistics.responded) == (1, 1)
+            assert statistics.undeliverable == 0
 
 
 def _repr_of(number: int) -> str:

@@ -86,6 +86,48 @@ async def test_a_dropped_response_is_noticed_under_every_warning_filter(
             assert warnings.filters == filters
 
 
+QUIET = """
+import asyncio
+import rclpy
+import rosasync
+from rclpy.qos import QoSDurabilityPolicy, QoSProfile
+from rclpy.signals import SignalHandlerOptions
+from tests.support.echo import ECHO, request_of, service_class
+from tests.support.serving import echo_call
+
+async def main():
+    async with rosasync.Session("quiet") as session:
+        server = session.serve(ECHO, "/quiet", echo_call)
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+        node = rclpy.create_node("stock")
+        transient = QoSProfile(depth=10, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
+        client = node.create_client(service_class(ECHO), "/quiet", qos_profile=transient)
+        # It never becomes ready, because it cannot receive a response.
+        while not server.statistics().undeliverable:
+            client.call_async(request_of("text"))
+            await asyncio.sleep(0.05)
+        print("refused")
+        rclpy.shutdown()
+
+asyncio.run(main())
+"""
+
+
+async def test_the_warning_of_rclpy_is_not_on_stderr() -> None:
+    """It says that the client will not get a response that is sent again."""
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-W", "default", "-c", QUIET),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        cwd=ROOT,
+    )
+    async with asyncio.timeout(4 * LIMIT):
+        output, errors = await process.communicate()
+    assert b"refused" in output
+    assert b"RuntimeWarning" not in errors
+    assert b"cannot be delivered" in errors
+
+
 CLIENTS = """
 import sys, threading, time
 import rclpy

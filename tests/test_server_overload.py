@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from typing import TYPE_CHECKING, Any, Literal
 
 import pytest
 
 from rosasync import Limits, Session
 from rosasync._server.backlog import INTERVAL, TARGET
+from rosasync._server.handlers import LONG
 from rosasync._server.overload import CALM
 from tests.support.echo import ECHO
 from tests.support.serving import AnyCall, Response, ask, echo_of, settled
@@ -196,3 +198,21 @@ async def test_iterators_get_the_newest_too(
             call.respond(Response(message=call.request.load_namespace))
         assert order == ["3", "2", "1", "0"]
         await asyncio.gather(*tasks)
+
+
+async def test_plain_handlers_get_the_newest_too(fake_graph: FakeGraph) -> None:
+    """They block the loop, so that requests wait in the middleware, which knows no turns."""
+    order: list[str] = []
+
+    def handler(call: AnyCall) -> Any:
+        time.sleep(STANDING if not order else 2 * LONG)
+        order.append(call.request.load_namespace)
+        return echo_of(call.request)
+
+    async with fake_graph.session(limits=MANY) as session:
+        server = session.serve(ECHO, "/served", handler)
+        tasks = [ask(session, "/served", str(number), timeout=None) for number in range(5)]
+        await until(lambda: order)
+        await server.aclose()
+        assert order == ["0", "4", "3", "2", "1"]
+        assert await asyncio.gather(*tasks) == ["0", "1", "2", "3", "4"]

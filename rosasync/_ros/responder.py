@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import ctypes
+import re
 import struct
 import threading
+import warnings
 from collections import Counter
 from collections.abc import Hashable
 from dataclasses import dataclass
@@ -53,6 +55,9 @@ INFO = struct.Struct("<qq16sq")
 # But for every warning, before it applies the filters, CPython stores their version in the registry
 # of the module that warns. So a registry that is not empty shows that there was a warning.
 __warningregistry__: dict[Any, Any] = {}
+# Its text, that the client will not receive the response, would be on stderr, and would be wrong:
+# the response is sent again.
+warnings.filterwarnings("ignore", category=RuntimeWarning, module=re.escape(__name__) + "$")
 # Held from a send until the registry was looked at, because all threads share it. Reentrant,
 # because the garbage collector may run a __del__ that sends.
 _sends = threading.RLock()

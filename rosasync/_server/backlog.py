@@ -104,7 +104,14 @@ class Backlog(Generic[T]):
         return now - self._oldest().arrived if self._requests else 0.0
 
     def put(
-        self, item: T, client: Hashable, size: int, now: float, *, room: int = 0
+        self,
+        item: T,
+        client: Hashable,
+        size: int,
+        now: float,
+        *,
+        waited: float = 0.0,
+        room: int = 0,
     ) -> Sequence[T]:
         """Add a request.
 
@@ -113,13 +120,14 @@ class Backlog(Generic[T]):
             client: who sent it. Requests of unknown clients share one key.
             size: its size in bytes.
             now: the time.
+            waited: for how many seconds it has waited elsewhere.
             room: how many requests may wait beyond the limit, because they are about to be popped.
 
         Returns:
             What is dropped for it, mostly nothing. It may be the request itself.
         """
         self._number += 1
-        waiting = _Waiting(self._number, item, client, size, now)
+        waiting = _Waiting(self._number, item, client, size, now - waited)
         self._requests[waiting.number] = waiting
         owner = self._clients.get(client)
         if owner is None:

@@ -57,6 +57,9 @@ OverloadHook: TypeAlias = Callable[
 
 logger = logging.getLogger("rosasync")
 
+LONG = 0.001
+"""Seconds from which a plain handler is long: the loop should look for requests after it."""
+
 
 @dataclass(frozen=True, slots=True)
 class HandlerKind(Generic[RequestT, ResponseT]):
@@ -89,6 +92,7 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
 
     Attributes:
         running: how many handlers run.
+        was_long: whether the handler that was started last has blocked the loop for `LONG`.
     """
 
     def __init__(
@@ -101,6 +105,7 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
         on_finished: Callable[[], None],
     ) -> None:
         self.running = 0
+        self.was_long = False
         self._kind = kind
         self._on_error = on_error
         self._sender = sender
@@ -174,8 +179,10 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
         try:
             return invoke(call) if context is None else context.run(invoke, call)
         finally:
-            if monotonic() - began > BLOCKING:
-                self._blocking.report(monotonic() - began)
+            took = monotonic() - began
+            self.was_long = took > LONG
+            if took > BLOCKING:
+                self._blocking.report(took)
 
     def _never_ran(self, call: ServiceCall[RequestT, ResponseT], pending: Awaitable[Any]) -> None:
         """Settle a call whose handler's task was cancelled before it began."""

@@ -51,12 +51,18 @@ class Intake(Generic[RequestT, ResponseT]):
         """For how many seconds the oldest call has waited; 0 if none waits."""
         return self._backlog.oldest_age(self._loop.time())
 
-    def put(self, call: ServiceCall[RequestT, ResponseT], client: Hashable) -> None:
-        """Let a call wait, or drop one: this, or another."""
+    def put(self, call: ServiceCall[RequestT, ResponseT], client: Hashable, waited: float) -> None:
+        """Let a call wait, or drop one: this, or another.
+
+        Args:
+            call: the call.
+            client: who sent it.
+            waited: for how many seconds it has waited already.
+        """
         backlog = self._backlog
         now = self._loop.time()
         size = payload_size(call.request)
-        dropped = backlog.put(call, client, size, now, room=self._getting)
+        dropped = backlog.put(call, client, size, now, waited=waited, room=self._getting)
         self._log.update(
             backlog.standing or bool(dropped), len(dropped), len(backlog), backlog.oldest_age(now)
         )

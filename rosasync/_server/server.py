@@ -7,7 +7,7 @@ import functools
 import logging
 import math
 from collections.abc import Callable
-from time import monotonic_ns
+from time import monotonic_ns, time_ns
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Generic, Literal, Self
 
@@ -48,6 +48,8 @@ CLOSE_TIMEOUT = 5.0
 """Seconds to wait for handlers to finish when a server is closed."""
 CANCEL_TIMEOUT = 1.0
 """Seconds to wait for cancelled handlers to end, before they are left behind."""
+MOST_WAITED = 60.0
+"""Seconds that a request is taken to have waited in the middleware at most."""
 
 
 class ServiceServer(Generic[RequestT, ResponseT]):
@@ -103,6 +105,8 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         self._end_task: asyncio.Task[None] | None = None
         # Whether `_start_waiting` is active, so that it is not entered again.
         self._starting = False
+        # Whether to look for further requests before the next handler, see `_start`.
+        self._paused = False
         service = node.describe(srv_type, srv_name, qos)
         self._name, self._type_name, _ = service.key
         self._tracing = tracing
@@ -295,14 +299,32 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         now = monotonic_ns()
         trace = self._traces.start(now) if now >= self._tracing.quiet_until else None
         call = ServiceCall(self, request, header, self._sender, now, trace)
-        if self._has_handler and not self._intake and self._runner.running < self._concurrency:
+        if not self._intake and self._can_start:
             # It has not waited.
             self._backlog.last_age = 0.0
-            self._runner.start(call)
+            self._start(call)
         else:
-            self._intake.put(call, self._port.client_of(header))
+            self._intake.put(call, self._port.client_of(header), _waited(header))
             if self._has_handler:
                 self._start_waiting()
+
+    @property
+    def _can_start(self) -> bool:
+        free = self._runner.running < self._concurrency
+        return free and self._has_handler and not self._paused
+
+    def _start(self, call: ServiceCall[RequestT, ResponseT]) -> None:
+        self._runner.start(call)
+        if self._runner.was_long:
+            # The requests that have arrived meanwhile are still in the queue of the middleware. If
+            # the next handler were run now, they would be served in their order, however old they
+            # are. So first the loop takes them, and then the backlog decides.
+            self._paused = True
+            self._loop.call_soon(self._go_on)
+
+    def _go_on(self) -> None:
+        self._paused = False
+        self._start_waiting()
 
     def _start_waiting(self) -> None:
         # An eager task (Python 3.12) may finish its handler inside `start`, which calls this again.
@@ -311,8 +333,8 @@ class ServiceServer(Generic[RequestT, ResponseT]):
             return
         self._starting = True
         try:
-            while self._intake and self._runner.running < self._concurrency:
-                self._runner.start(self._intake.pop())
+            while self._intake and self._can_start:
+                self._start(self._intake.pop())
         finally:
             self._starting = False
 
@@ -361,6 +383,10 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         if not self._has_handler:
             self._drop_waiting()
         await self._tasks.wait(deadline)
+        while self._paused and (deadline is None or self._loop.time() < deadline):
+            # Plain handlers run in one turn of the loop each.
+            await asyncio.sleep(0)
+            await self._tasks.wait(deadline)
         self._drop_waiting()
         if self._tasks:
             self._tasks.cancel()
@@ -376,6 +402,15 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         await self._sender.wait_until_delivered(left)
         await asyncio.sleep(self._port.destroy_delay)
         self.end(functools.partial(SessionClosed, f"{self._name}: the server is closed"))
+
+
+def _waited(header: RequestHeader) -> float:
+    """Return how many seconds a request has waited in the middleware while the loop was busy.
+
+    The middleware uses the system's clock, which may be set at any time.
+    """
+    received = header.received_timestamp
+    return min(max(0.0, (time_ns() - received) / 1e9), MOST_WAITED) if received > 0 else 0.0
 
 
 def _check_order(order: Order) -> Order:
