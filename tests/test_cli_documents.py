@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import json
 import math
+import re
+import time
 from typing import Any
+from unittest import mock
 
 import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from nav_msgs.msg import Path
+from nav_msgs.srv import GetPlan
 from rcl_interfaces.msg import ParameterValue
+from std_msgs.msg import Header
 from std_srvs.srv import SetBool
 
 from rosasync import to_dict, to_message
@@ -18,11 +24,11 @@ from rosasync._cli.documents import (
     DocumentError,
     documents,
     dump_json,
-    dump_yaml,
     plain,
     read_message,
 )
-from rosasync._cli.requests import template
+from rosasync._cli.emitter import dump_yaml
+from rosasync._cli.requests import rounds_of, template
 from rosasync._ros.fields import FieldType, field_types
 from rosasync._ros.interfaces import installed_types, parts
 
@@ -87,6 +93,7 @@ TEXTS = st.sampled_from([*SURPRISES, *CHARACTERS]) | st.text(
     st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=8
 )
 
+TEXT_KEYS = st.sampled_from(["a", "no", "frame_id", "x1", "data"])
 _BITS = {"int8": 8, "int16": 16, "int32": 32, "int64": 64}
 
 
@@ -198,6 +205,98 @@ def test_what_does_not_fit_is_refused(message_type: Any, text: str, says: str) -
     with pytest.raises(DocumentError) as refused:
         read_message(message_type, text)
     assert says in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("message_type", "text", "says"),
+    [
+        (SetBool.Request, "data: 3", "data: expected bool, got 3"),
+        (SetBool.Request, "data: maybe", "data: expected bool, got maybe"),
+        (SetBool.Request, "data:", "data: expected bool, got nothing"),
+        (SetBool.Request, "data: 'on'", "data: expected bool, got str 'on'"),
+        (ParameterValue, "integer_value: 1.5", "integer_value: expected int64, got 1.5"),
+        (
+            ParameterValue,
+            "double_array_value: [1, far]",
+            "double_array_value[1]: expected float64, got far",
+        ),
+        (ParameterValue, "bool_array_value: yes", "bool_array_value: expected bool[], got yes"),
+        (Header, "stamp: soon", "stamp: expected builtin_interfaces/msg/Time, got soon"),
+        (Header, "stamp: auto", "stamp: expected builtin_interfaces/msg/Time, got auto"),
+    ],
+)
+def test_an_error_shows_the_value_as_it_was_written(
+    message_type: Any, text: str, says: str
+) -> None:
+    with pytest.raises(DocumentError) as refused:
+        read_message(message_type, text)
+    assert str(refused.value) == says
+
+
+def test_now_and_auto_are_the_time_at_which_the_request_is_read() -> None:
+    before = time.time_ns()
+    header = read_message(Header, "{stamp: now, frame_id: now}")
+    request = read_message(GetPlan.Request, "{start: {header: auto}, goal: {header: 'auto'}}")
+    path = read_message(Path, "{header: auto, poses: [{header: {stamp: now}}, {header: auto}]}")
+    after = time.time_ns()
+    stamps = [header.stamp, request.start.header.stamp, request.goal.header.stamp]
+    stamps += [path.header.stamp, *(pose.header.stamp for pose in path.poses)]
+    for stamp in stamps:
+        assert before <= stamp.sec * 10**9 + stamp.nanosec <= after
+    assert header.frame_id == "now"
+    assert request.start.header.frame_id == ""
+
+
+def test_each_round_has_its_own_time() -> None:
+    timed = rounds_of(Header, "stamp: now")
+    assert next(timed) != next(timed)
+    fixed = rounds_of(Header, "frame_id: map")
+    assert next(fixed)[0] is next(fixed)[0]
+
+
+class _AsBefore(yaml.SafeDumper):
+    """PyYAML, told to write lists of scalars in one line."""
+
+    def ignore_aliases(self, data: object) -> bool:
+        return True
+
+
+def _list(dumper: Any, data: list[Any]) -> Any:
+    flat = not any(isinstance(item, dict | list) for item in data)
+    return dumper.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=flat)
+
+
+_AsBefore.add_representer(list, _list)
+_WORDS = st.sampled_from([*SURPRISES, *CHARACTERS, "a, b", "[a]", "y", "=", "-", "?", "!a", "x y"])
+_SCALARS = (
+    st.booleans() | st.integers() | st.floats() | st.none() | _WORDS.filter(lambda t: "\n" not in t)
+)
+_LEAVES: st.SearchStrategy[Any] = _SCALARS | st.lists(_SCALARS, max_size=3) | st.just({})
+
+
+def _mappings(values: st.SearchStrategy[Any]) -> st.SearchStrategy[dict[str, Any]]:
+    return st.dictionaries(TEXT_KEYS, values, min_size=1, max_size=3)
+
+
+_INNER = _mappings(_LEAVES)
+_NESTED = _mappings(_LEAVES | _INNER | st.lists(_INNER, min_size=1, max_size=2))
+
+
+@settings(max_examples=100, deadline=None)
+@given(_mappings(_NESTED | _LEAVES | st.lists(_NESTED, min_size=1, max_size=2)))
+def test_yaml_has_the_form_of_pyyaml(value: dict[str, Any]) -> None:
+    written = dump_yaml(value)
+    assert repr(yaml.safe_load(written)) == repr(value)
+    if not re.search(r"[\t\x7f-\x9f\u2028]", repr(value).encode().decode("unicode_escape")):
+        options: Any = {"sort_keys": False, "allow_unicode": True, "width": 10**9}
+        assert written == yaml.dump(value, Dumper=_AsBefore, **options).removesuffix("\n")
+
+
+def test_numbers_are_written_without_an_object_for_each() -> None:
+    with mock.patch("yaml.dump", side_effect=AssertionError("too slow")):
+        assert dump_yaml({"data": [1, 2], "k": [0.5, math.inf, 1e20], "name": "map"}) == (
+            "data: [1, 2]\nk: [0.5, .inf, 1.0e+20]\nname: map"
+        )
 
 
 def test_a_stream_is_split_at_its_marks() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -16,7 +17,7 @@ from rosasync._cli.graph import find_type, srv_class
 from rosasync._cli.load import Tally, make_calls
 from rosasync._cli.options import AsJson, Name, OptionalType, OptionalYaml, Timeout
 from rosasync._cli.output import note, pick, print_json, print_value, progress
-from rosasync._cli.requests import requests_from, split_type, template
+from rosasync._cli.requests import requests_from, rounds_of, split_type, template
 from rosasync._cli.run import fail, open_session, run
 
 __all__ = ["call"]
@@ -96,8 +97,8 @@ class _Order:
             async for request in requests_from(srv_class.Request, self.text):
                 yield request
             return
-        messages = [m async for m in requests_from(srv_class.Request, self.text)]
-        for _ in range(self.count):
+        rounds = rounds_of(srv_class.Request, self.text)
+        for messages in itertools.islice(rounds, self.count):
             for message in messages:
                 yield message
 

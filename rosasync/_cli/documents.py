@@ -1,4 +1,4 @@
-"""YAML and JSON of messages, read and written.
+"""YAML and JSON of messages, read; and JSON written.
 
 A plain scalar is read as its field needs it: the text ``on`` is true in a bool field and the text
 "on" in a string field, ``010`` is ten, and ``1e5`` is a number. YAML 1.1, which PyYAML implements,
@@ -10,26 +10,23 @@ from __future__ import annotations
 import json
 import math
 import re
+import time
 from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any
 
 import yaml
 
+from rosasync._cli.emitter import UNREADABLE
 from rosasync._ros.fields import FieldType, field_types
 from rosasync._ros.messages import to_dict, to_message
-from rosasync._ros.types import type_name
+from rosasync._ros.types import Unquoted, type_name
 
-__all__ = ["DocumentError", "documents", "dump_json", "dump_yaml", "plain", "read_message"]
+__all__ = ["DocumentError", "documents", "dump_json", "plain", "read_message"]
 
 _Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-_Dumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
-
-_UNREADABLE = re.compile(r"[\x7f-\x9f\u2028\u2029\ufeff\ufffe\uffff]")
-"""Characters that JSON allows in a text and YAML does not, or takes for the end of a line."""
-
-_ONE_LINE = 2**31 - 1
-
+_TIME = "builtin_interfaces/msg/Time"
+_HEADER = "std_msgs/msg/Header"
 _TRUE = {"true", "yes", "on"}
 _FALSE = {"false", "no", "off"}
 _INTEGER = re.compile(r"[-+]?(0x[0-9a-f_]+|0o[0-7_]+|0b[01_]+|[0-9][0-9_]*)", re.IGNORECASE)
@@ -48,7 +45,7 @@ class DocumentError(ValueError):
     """A document that is not a message; the message says where and why."""
 
 
-class _Plain(str):
+class _Plain(Unquoted):
     """The text of a scalar without quotes."""
 
     __slots__ = ()
@@ -65,21 +62,6 @@ def _construct_text(_: Any, node: Any) -> str:
 
 
 _TextLoader.add_constructor("tag:yaml.org,2002:str", _construct_text)
-
-
-class _BlockDumper(_Dumper):  # type: ignore[misc]
-    """Writes mappings as blocks, and lists of numbers and texts in one line."""
-
-    def ignore_aliases(self, data: object) -> bool:
-        return True
-
-
-def _represent_list(dumper: Any, data: list[Any]) -> Any:
-    flat = not any(isinstance(item, dict | list) for item in data)
-    return dumper.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=flat)
-
-
-_BlockDumper.add_representer(list, _represent_list)
 
 
 def read_message(message_type: type[Any], text: str) -> Any:
@@ -118,18 +100,10 @@ def plain(message: Any) -> dict[str, Any]:
     return _plain_fields(to_dict(message), type(message))
 
 
-def dump_yaml(value: object) -> str:
-    """Return a value as YAML, without the final line break."""
-    text: str = yaml.dump(
-        value, Dumper=_BlockDumper, sort_keys=False, allow_unicode=True, width=_ONE_LINE
-    )
-    return text.removesuffix("\n").removesuffix("\n...")
-
-
 def dump_json(value: object) -> str:
     """Return a value as one line of JSON; NaN and infinity become texts, which are read again."""
     text = json.dumps(_finite(value), ensure_ascii=False, allow_nan=False)
-    return _UNREADABLE.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
+    return UNREADABLE.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
 
 
 def _fit_fields(values: dict[Any, Any], message_type: type[Any]) -> dict[str, Any]:
@@ -142,6 +116,8 @@ def _fit_fields(values: dict[Any, Any], message_type: type[Any]) -> dict[str, An
 
 def _fit(value: Any, field: FieldType) -> Any:
     """Return a value as the field needs it. What does not fit is left for `to_message`."""
+    if field.message_type is not None and isinstance(value, str):
+        return _expand(value, field.message_type)
     if isinstance(value, dict) and field.message_type is not None:
         return _fit_fields(value, field.message_type)
     if isinstance(value, list) and field.element is not None:
@@ -162,7 +138,22 @@ def _fit_text(text: _Plain, field: FieldType) -> Any:
     if field.kind == "float":
         with suppress(ValueError):
             return float(text)
-    return str(text)
+    return str(text) if field.kind == "string" else text
+
+
+def _expand(word: str, message_type: type[Any]) -> Any:
+    """Return what ``now`` stands for in a stamp, and ``auto`` in a header, as in ``ros2``."""
+    wanted = type_name(message_type)
+    if (word, wanted) == ("now", _TIME):
+        return _now()
+    if (word, wanted) == ("auto", _HEADER):
+        return {"stamp": _now()}
+    return word
+
+
+def _now() -> dict[str, int]:
+    sec, nanosec = divmod(time.time_ns(), 1_000_000_000)
+    return {"sec": sec, "nanosec": nanosec}
 
 
 def _plain_fields(values: dict[str, Any], message_type: type[Any]) -> dict[str, Any]:
@@ -186,7 +177,7 @@ def _finite(value: Any) -> Any:
     if isinstance(value, dict):
         return {name: _finite(item) for name, item in value.items()}
     if isinstance(value, list):
-        return [_finite(item) for item in value]
+        return value if {*map(type, value)} <= {int, str} else [_finite(item) for item in value]
     if isinstance(value, float) and not math.isfinite(value):
         return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
     return value

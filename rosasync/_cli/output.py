@@ -9,7 +9,8 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
-from rosasync._cli.documents import dump_json, dump_yaml
+from rosasync._cli.documents import dump_json
+from rosasync._cli.emitter import dump_yaml
 from rosasync._cli.errors import CliError
 
 if TYPE_CHECKING:

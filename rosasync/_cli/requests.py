@@ -10,15 +10,17 @@ from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any
 
-from rosasync._cli.documents import DocumentError, documents, dump_yaml, plain, read_message
+from rosasync._cli.documents import DocumentError, documents, plain, read_message
+from rosasync._cli.emitter import dump_yaml
 from rosasync._cli.errors import CliError, join
 from rosasync._ros.interfaces import Field, fields
 from rosasync._ros.types import type_name
 
-__all__ = ["message_from", "requests_from", "split_type", "template"]
+__all__ = ["message_from", "requests_from", "rounds_of", "split_type", "template"]
 
 STDIN = "-"
 CHUNK = 65536
+_TIMED = re.compile(r"\b(now|auto)\b")
 
 
 def split_type(srv_type: str | None, text: str | None) -> tuple[str | None, str | None]:
@@ -52,6 +54,21 @@ async def requests_from(message_type: type[Any], text: str | None) -> AsyncItera
         return
     async for document in _stdin_documents():
         yield _read(message_type, document)
+
+
+def rounds_of(message_type: type[Any], text: str | None) -> Iterator[list[Any]]:
+    """Yield the requests of an argument or a file for ever, read again if they have a time of now.
+
+    Raises:
+        CliError: as `requests_from`.
+    """
+    found = list(documents(_text_of(text or "{}"))) or ["{}"]
+    timed = any(_TIMED.search(document) for document in found)
+    messages = [_read(message_type, document) for document in found]
+    while True:
+        yield messages
+        if timed:
+            messages = [_read(message_type, document) for document in found]
 
 
 def template(message_type: type[Any]) -> str:

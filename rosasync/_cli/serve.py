@@ -191,7 +191,7 @@ def _pair_fields(srv_class: type[Any]) -> dict[str, str]:
 
     Both have the same type.
     """
-    left = field_types(srv_class.Request)
+    left = dict(field_types(srv_class.Request))
     pairs: dict[str, str] = {}
     for name, kind in field_types(srv_class.Response).items():
         same = [other for other, its_kind in left.items() if its_kind == kind]

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from rosasync._cli.documents import dump_yaml, plain
+from rosasync._cli.documents import plain
+from rosasync._cli.emitter import dump_yaml
 from rosasync._cli.errors import CliError, Code
 from rosasync._cli.graph import explain_type
 from rosasync._cli.options import AnyType, AsJson

@@ -24,6 +24,7 @@ import sys
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, Literal
 
 from rosasync._ros.types import hint, shown, type_name
@@ -71,13 +72,21 @@ class FieldType:
     element: FieldType | None = None
 
 
-def field_types(message_type: type[Any]) -> dict[str, FieldType]:
+_described: dict[type[Any], Mapping[str, FieldType]] = {}
+
+
+def field_types(message_type: type[Any]) -> Mapping[str, FieldType]:
     """Return the type of each field of a message class, by name.
 
     Raises:
         TypeError: not a message class.
     """
-    return {name: field.describe() for name, field in fields_of(message_type).items()}
+    known = fields_of(message_type)
+    found = _described.get(message_type)
+    if found is None:
+        found = MappingProxyType({name: field.describe() for name, field in known.items()})
+        _described[message_type] = found
+    return found
 
 
 class InvalidField(Exception):

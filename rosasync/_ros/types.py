@@ -14,7 +14,13 @@ import reprlib
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-__all__ = ["hint", "service_type", "shown", "type_name"]
+__all__ = ["Unquoted", "hint", "service_type", "shown", "type_name"]
+
+
+class Unquoted(str):
+    """A scalar of YAML without quotes, whose type is that of its field."""
+
+    __slots__ = ()
 
 
 def service_type(srv_type: type[Any] | str) -> type[Any]:
@@ -59,6 +65,8 @@ def shown(value: object) -> str:
         return "None"
     if isinstance(value, type):
         return f"the class {type_name(value)}"
+    if isinstance(value, Unquoted):
+        return reprlib.repr(value)[1:-1] or "nothing"
     name = type_name(type(value))
     return f"{name} {reprlib.repr(value)}" if isinstance(value, str | bytes | float | int) else name
 
