@@ -278,14 +278,18 @@ class LifecycleClient(NodeClient):
         ) from error
 
     def _failed(self, label: str, state: LifecycleState | None) -> TransitionError:
-        found = "its state could not be read" if state is None else f"it is {state}"
-        starts = " or ".join(TRANSITIONS[label].ids)
-        return self._error(
-            TransitionFailed,
-            label,
-            state,
-            f"refused, or its callback failed; {found}, and {label} starts from {starts}",
-        )
+        starts = TRANSITIONS[label].ids
+        if state is None:
+            details = "refused, or its callback failed; its state could not be read"
+        elif state in starts:
+            details = f"its callback failed; it is {state} as before"
+        else:
+            # Also after an error in a callback, which leads to unconfigured or finalized.
+            allowed = " or ".join(starts)
+            details = (
+                f"refused, or its callback failed; it is {state}, and {label} starts from {allowed}"
+            )
+        return self._error(TransitionFailed, label, state, details)
 
     def _error(
         self, kind: type[TransitionError], label: str, state: LifecycleState | None, details: str

@@ -107,12 +107,13 @@ def test_template_is_a_request_to_edit_and_send() -> None:
         pytest.param((LAMP, LAMP_TYPE, "data: ["), 2, "not YAML", id="yaml"),
         pytest.param((LAMP, LAMP_TYPE, "@/no/such/file"), 2, "cannot read", id="file"),
         pytest.param((LAMP, "no_msgs/srv/Type", "{}"), 2, "ros-<distribution>-no-msgs", id="type"),
-        pytest.param(("not a name", LAMP_TYPE), 2, "not a valid service name", id="name"),
+        pytest.param(("not a name", LAMP_TYPE), 2, "'not_a_name' is a valid one", id="name"),
         pytest.param((LAMP, "--count", "0"), 2, "rosasync call --help", id="usage"),
         pytest.param((LAMP, "--field", "nothing"), 2, "there is success, message", id="path"),
         pytest.param(("/lamp/none", LAMP_TYPE, "--timeout", "1"), 3, "rosasync why", id="none"),
-        pytest.param(("/lamp/none", "--timeout", "1"), 3, "rosasync why", id="type unknown"),
-        pytest.param((LAMP, "std_srvs/srv/Trigger", "--timeout", "2"), 3, LAMP_TYPE, id="other"),
+        pytest.param(
+            ("/lamp/swich", "--timeout", "1"), 3, f"there are {LAMP} ({LAMP_TYPE})", id="no type"
+        ),
         pytest.param(("/lamp/silent", "--timeout", "3"), 4, "--timeout", id="timeout"),
     ],
 )
@@ -123,6 +124,14 @@ def test_a_failure_has_an_exit_code_and_one_line(
     assert (done.returncode, done.stdout) == (code, "")
     assert says in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+def test_another_type_is_a_warning_before_it_is_an_error() -> None:
+    done = rosasync("call", LAMP, "std_srvs/srv/Trigger", "--timeout", "4")
+    assert done.returncode == 3
+    warning, error = done.stderr.splitlines()
+    assert "callers wait for a server of type std_srvs/srv/Trigger" in warning
+    assert f"this name is served as {LAMP_TYPE}" in error
 
 
 def test_failures_of_several_calls_are_counted_by_kind() -> None:

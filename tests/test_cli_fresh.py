@@ -212,3 +212,9 @@ def test_a_domain_above_the_safe_ones() -> None:
     [found] = [check for check in checks if check["check"] == "domain"]
     assert found["ok"] is None
     assert "outgoing connections" in found["todo"]
+
+
+def test_profile_as_json() -> None:
+    (found,) = json_lines(rosasync("profile", "--distribution", "kilted", "--json").stdout)
+    assert found["variable"] == "FASTDDS_DEFAULT_PROFILES_FILE"
+    assert found["profile"] == rosasync("profile", "--distribution", "kilted").stdout

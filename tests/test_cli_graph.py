@@ -41,6 +41,7 @@ def test_type_and_find() -> None:
     assert json_lines(rosasync("find", "nav_msgs/srv/GetMap", "--json").stdout) == []
     missing = rosasync("type", "/lamp/none", "--timeout", "1")
     assert (missing.returncode, missing.stdout) == (3, "")
+    assert f"there are {LAMP} ({LAMP_TYPE})" in missing.stderr
 
 
 def test_info_shows_nodes_and_clashes() -> None:

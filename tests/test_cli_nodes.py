@@ -204,9 +204,9 @@ class TestLifecycle:
     async def test_what_fails_or_is_wrong(self, nodes: NodesProcess) -> None:
         failing, slow = await nodes.add("failing"), await nodes.add("slow")
         for arguments, code, message in (
-            (("set", failing, "configure"), 1, "configure starts from unconfigured"),
+            (("set", failing, "configure"), 1, "its callback failed; it is unconfigured as before"),
             (("set", failing, "activate"), 1, "it is unconfigured"),
-            (("set", failing, "explode"), 2, "explode"),
+            (("set", failing, "explode"), 2, "'transition': 'explode' is not one of"),
             (("get", "/absent", "--timeout", str(TICK)), 3, "/absent/get_state"),
             (("set", slow, "configure", "--timeout", str(60 * TICK)), 4, "(unknown)"),
         ):

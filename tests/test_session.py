@@ -274,6 +274,25 @@ async def test_anyios_deadlines_and_task_groups(session: Session, server: Server
     assert statistics.completed == 51
 
 
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("a b", r"must not contain characters .* \(at character 2\); 'a_b' is a valid one"),
+        ("/a//b", r"repeated '/' \(at character 4\); '/a/b' is a valid one"),
+        ("1a", r"a part of it must not start with a number \(at character 1\); '_1a' is"),
+        ("/a/", r"must not end with a forward slash .*; '/a' is"),
+        ("a{b}", r"unknown substitution"),
+        ("", r"must not be empty"),
+    ],
+)
+async def test_a_name_that_ros_does_not_allow(name: str, says: str) -> None:
+    async with Session("names") as session:
+        with pytest.raises(InvalidServiceName, match=f"is not a valid service name: .*{says}") as e:
+            session.client(Trigger, name)
+    assert ".c:" not in str(e.value)
+    assert "\n" not in str(e.value)
+
+
 async def test_ready_or_not(session: Session, server: ServerProcess) -> None:
     assert not session.service_is_ready(ECHO, "/echo")
     with pytest.raises(ServiceUnavailable):

@@ -85,7 +85,8 @@ def main() -> int:
 
 def _line_of(error: Any) -> str:
     command = error.ctx.command_path if error.ctx else "rosasync"
-    text = " ".join(error.format_message().split())
+    # Newer versions of click say so of a value that is not one of the choices.
+    text = " ".join(error.format_message().split()).replace("Value error, ", "")
     return join(text, f"Try: {command} --help")
 
 

@@ -15,6 +15,7 @@ __all__ = [
     "explain_type",
     "find_type",
     "is_hidden",
+    "no_server",
     "resolve",
     "settle",
     "srv_class",
@@ -79,14 +80,25 @@ async def find_type(session: rosasync.Session, name: str, timeout: float | None)
     """
     types = await wait_for_types(session, name, timeout)
     if not types:
-        raise CliError(
-            f"{name}: no server within {timeout:g} s, so its type is not known. Give the TYPE, or "
-            f"try: rosasync why {name}",
-            Code.NO_SERVER,
-        )
+        raise no_server(session, name, timeout)
     if len(types) > 1:
         raise CliError(f"{name} is served with several types: give one of {', '.join(types)}")
     return types[0]
+
+
+def no_server(session: rosasync.Session, name: str, timeout: float | None) -> CliError:
+    """Return the error for a service that has no server; it lists the similar names."""
+    from rosasync._ros.graph import describe_similar
+    from rosasync._ros.inspect import services
+
+    own = f"{session.node.get_fully_qualified_name()}/"
+    others = {n: types for n, types in services(session.node).items() if not n.startswith(own)}
+    similar = describe_similar(others, resolve(session, name))
+    instead = f"; there are {similar}" if similar else ""
+    within = "" if timeout is None else f" within {timeout:g} s"
+    return CliError(
+        f"{name}: no server of this name{within}{instead}. Try: rosasync why {name}", Code.NO_SERVER
+    )
 
 
 def srv_class(name: str) -> Any:

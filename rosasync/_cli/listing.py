@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rosasync._cli.errors import CliError, Code
-from rosasync._cli.graph import is_hidden, resolve, settle, wait_for_types
+from rosasync._cli.errors import Code
+from rosasync._cli.graph import is_hidden, no_server, resolve, settle, wait_for_types
 from rosasync._cli.options import AsJson, Hidden, Name, Type, Wait
 from rosasync._cli.output import print_json
 from rosasync._cli.run import open_session, run
@@ -16,7 +16,7 @@ from rosasync._cli.run import open_session, run
 if TYPE_CHECKING:
     from rosasync._ros.inspect import Endpoint
 
-__all__ = ["clashes", "find", "info", "list_services", "no_server", "nodes", "type_of"]
+__all__ = ["clashes", "find", "info", "list_services", "nodes", "type_of"]
 
 
 def list_services(
@@ -64,8 +64,8 @@ def type_of(
 async def _type_of(name: str, as_json: bool, timeout: float) -> None:
     async with open_session() as session:
         types = await wait_for_types(session, name, timeout)
-    if not types:
-        raise no_server(name, timeout)
+        if not types:
+            raise no_server(session, name, timeout)
     if as_json:
         print_json({"name": name, "types": types})
     else:
@@ -192,13 +192,6 @@ async def _services(wait: float | None) -> dict[str, list[str]]:
         own = f"{session.node.get_fully_qualified_name()}/"
         found = services(session.node)
     return {name: types for name, types in found.items() if not name.startswith(own)}
-
-
-def no_server(name: str, timeout: float) -> CliError:
-    """Return the error for a service that has no server."""
-    return CliError(
-        f"{name}: no server within {timeout:g} s. Try: rosasync why {name}", Code.NO_SERVER
-    )
 
 
 def _described(endpoint: Endpoint) -> dict[str, Any]:

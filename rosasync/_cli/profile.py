@@ -9,6 +9,8 @@ import typer
 
 from rosasync._cli.errors import CliError, Code
 from rosasync._cli.fresh import fresh_profile
+from rosasync._cli.options import AsJson
+from rosasync._cli.output import print_json
 from rosasync._cli.run import fail
 from rosasync._ros.domain import environment_domain
 from rosasync._ros.profile import ANNOUNCEMENT, is_old, profile_text, profile_variable
@@ -35,6 +37,7 @@ def profile(
             "--fresh", help="With a port that no dead process has left behind, for one start."
         ),
     ] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Print a Fast DDS profile for the environment of stock nodes.
 
@@ -57,6 +60,9 @@ def profile(
     except (CliError, RosasyncError) as error:
         fail(error)
         raise typer.Exit(Code.FAILED) from None
+    if as_json:
+        print_json({"variable": profile_variable(old), "profile": text})
+        return
     typer.echo(text, nl=not text.endswith("\n"))
     option = " --fresh" if fresh else ""
     typer.echo(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 import os
 import signal
 import socket
@@ -18,7 +17,6 @@ import rosasync
 from rosasync._cli.errors import CliError, Code, code_of, line_of
 from rosasync._cli.signals import ended_by, interruptible
 from rosasync._cli.streams import OutputError
-from rosasync._client.mismatch import MISMATCH_LOGGER
 
 __all__ = ["fail", "interrupted", "open_session", "run"]
 
@@ -29,8 +27,6 @@ def run(command: Coroutine[Any, Any, int | None]) -> None:
     Raises:
         typer.Exit: always, with the exit code.
     """
-    # The command ends with an error that says the same.
-    logging.getLogger(MISMATCH_LOGGER).setLevel(logging.ERROR)
     try:
         code = asyncio.run(_woken_by_signals(command)) or Code.ANSWERED
         sys.stdout.flush()

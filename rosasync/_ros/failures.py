@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -19,6 +20,7 @@ __all__ = [
     "explain",
     "is_destroyed",
     "is_up",
+    "reason_of",
     "refusal",
     "topic_refusal",
     "uses_node",
@@ -26,6 +28,15 @@ __all__ = [
 
 RclpyError = (InvalidHandle, rclpy_implementation.RCLError)
 """What rclpy raises if an entity was destroyed, or if rcl reports an error."""
+
+
+_SOURCE = re.compile(r",? at \S+\.(?:c|cc|cpp|h|hpp):\d+(?:,\s*)?")
+"""Where rcl has raised an error, which it appends to each message."""
+
+
+def reason_of(error: Exception) -> str:
+    """Return what rclpy says of an error in one line, without the source files of rcl."""
+    return " ".join(_SOURCE.sub("", str(error)).split())
 
 
 def is_up(node: Node) -> bool:
@@ -60,7 +71,7 @@ def explain(node: Node, handle: Any, error: Exception) -> Exception:
         return ContextShutdown()
     if is_destroyed(handle):
         return PortDestroyed("the rclpy entity was destroyed")
-    return RosasyncError(f"rclpy reports an error of an entity: {error}")
+    return RosasyncError(f"rclpy reports an error of an entity: {reason_of(error)}")
 
 
 @contextmanager
@@ -76,7 +87,7 @@ def uses_node(node: Node) -> Iterator[None]:
         yield
     except RclpyError as error:
         check_up(node)
-        raise RosasyncError(f"rclpy reports an error of the node: {error}") from error
+        raise RosasyncError(f"rclpy reports an error of the node: {reason_of(error)}") from error
 
 
 def refusal(node: Node, service: Service, kind: str, error: Exception) -> Exception:
@@ -93,7 +104,7 @@ def refusal(node: Node, service: Service, kind: str, error: Exception) -> Except
         )
     return RosasyncError(
         f"{srv_name}: the middleware refused to create the {kind} of type {srv_type}; check the "
-        f"name, the QoS and how many entities this process has ({error})"
+        f"name, the QoS and how many entities this process has ({reason_of(error)})"
     )
 
 
@@ -103,5 +114,5 @@ def topic_refusal(node: Node, topic_name: str, error: Exception) -> Exception:
         return ContextShutdown()
     return RosasyncError(
         f"{topic_name}: the middleware refused the topic; check whether this process uses the name "
-        f"with another type ({error})"
+        f"with another type ({reason_of(error)})"
     )

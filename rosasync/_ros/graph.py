@@ -6,7 +6,7 @@ import contextlib
 import difflib
 import os
 from collections import Counter
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from time import monotonic
 from types import TracebackType
 from typing import Any
@@ -32,7 +32,7 @@ from rosasync._ros.failures import uses_node
 from rosasync._ros.names import default_qos
 from rosasync._ros.rcl import Rcl
 
-__all__ = ["GraphQueries", "GraphWaitable"]
+__all__ = ["GraphQueries", "GraphWaitable", "describe_similar"]
 
 SNAPSHOT_TIME = 0.25
 """Seconds for which a snapshot of the services is used if the node reports no graph events."""
@@ -161,11 +161,8 @@ class GraphQueries:
             services = self._others_services()
             if not services and len(self._node.get_node_names()) <= 1:
                 return f"no server has this name, and no other node is visible in {self._place()}"
-        same_type = sorted(name for name, types in services.items() if srv_type in types)
-        similar = difflib.get_close_matches(srv_name, services, n=3, cutoff=0.7)
-        if names := list(dict.fromkeys([*similar, *same_type[:3]])):
-            listed = ", ".join(f"{name} ({', '.join(sorted(services[name]))})" for name in names)
-            return f"no server has this name; there are {listed}"
+        if similar := describe_similar(services, srv_name, srv_type):
+            return f"no server has this name; there are {similar}"
         return (
             f"no server has this name or a similar one, among {len(services)} services of other "
             "nodes: start the server, or compare its name and namespace"
@@ -257,6 +254,22 @@ class GraphQueries:
         """Return how many servers of this resolved name the graph shows, of any type."""
         with self._node.handle:
             return int(self._node.handle.get_count_services(srv_name))
+
+
+def describe_similar(
+    services: Mapping[str, Iterable[str]], srv_name: str, srv_type: str = ""
+) -> str:
+    """List the services that may be meant by a name that has no server; empty if there are none.
+
+    Args:
+        services: the types of the services in the graph, by name.
+        srv_name: the name.
+        srv_type: the type that is meant, if it is known: services of this type are listed too.
+    """
+    similar = difflib.get_close_matches(srv_name, services, n=3, cutoff=0.7)
+    same_type = sorted(name for name, types in services.items() if srv_type in types)
+    names = dict.fromkeys([*similar, *same_type[:3]])
+    return ", ".join(f"{name} ({', '.join(sorted(services[name]))})" for name in names)
 
 
 def _names_of(services: Iterable[Any]) -> list[str]:

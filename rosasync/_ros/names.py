@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 from rclpy.exceptions import InvalidServiceNameException, InvalidTopicNameException
@@ -9,11 +10,12 @@ from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, qos_profile_services_default
 from rclpy.validate_full_topic_name import validate_full_topic_name
+from rclpy.validate_topic_name import validate_topic_name
 
 from rosasync._core.ports import Action, Service
 from rosasync._ros.action_types import action_type
 from rosasync._ros.checks import checker
-from rosasync._ros.failures import uses_node
+from rosasync._ros.failures import reason_of, uses_node
 from rosasync._ros.types import service_type, type_name
 from rosasync.errors import InvalidServiceName
 from rosasync.statistics import ServiceKey
@@ -24,6 +26,7 @@ __all__ = [
     "default_qos",
     "describe",
     "describe_action",
+    "reason_of_name",
     "resolve_name",
 ]
 
@@ -33,6 +36,16 @@ default get lost."""
 DEPTH_WITHOUT_HEARTBEATS = 10
 """History of clients, at least, without the profile: where packets get lost, a deep history blocks
 behind each of them for 3 s (docs/explanation/network.md)."""
+
+
+_RCL_SAYS = (
+    (r"^Invalid [a-z ]+: ", ""),
+    (r"^topic name '.*' is invalid: ", ""),
+    (r"^(topic|node) name token ", "a part of it "),
+    (r"^(topic|node) name ", "it "),
+    (r"must not be empty string", "must not be empty"),
+)
+"""The words of rcl, and what they are here."""
 
 
 def describe(node: Node, srv_type: Any, srv_name: str, qos: Any) -> Service:
@@ -101,10 +114,39 @@ def expand_name(node: Node, given: str, kind: str) -> str:
             "underscores, slashes and ~ at its start"
         )
     try:
-        with uses_node(node):
-            name = expand_topic_name(given, node.get_name(), node.get_namespace())
-            validate_full_topic_name(name, is_service=True)
+        return _expand(node, given)
     except (InvalidServiceNameException, InvalidTopicNameException, ValueError) as error:
-        reason = str(error).strip().replace("\n", " ")
-        raise InvalidServiceName(f"{given!r} is not a valid {kind} name: {reason}") from None
-    return str(name)
+        raise InvalidServiceName(
+            f"{given!r} is not a valid {kind} name: {reason_of_name(error)}{_suggest(node, given)}"
+        ) from None
+
+
+def reason_of_name(error: Exception) -> str:
+    """Return why rcl refuses a name, without the name and a mark under the place in it."""
+    reason, _, shown = str(error).strip().partition(":\n")
+    reason = reason_of(ValueError(reason))
+    for begin, instead in _RCL_SAYS:
+        reason = re.sub(begin, instead, reason)
+    place = shown.rpartition("\n")[2].find("^") - len("  '")
+    return f"{reason} (at character {place + 1})" if place >= 0 else reason
+
+
+def _expand(node: Node, given: str) -> str:
+    with uses_node(node):
+        # First, because it says where the mistake is.
+        validate_topic_name(given, is_service=True)
+        name = expand_topic_name(given, node.get_name(), node.get_namespace())
+        validate_full_topic_name(name, is_service=True)
+        return str(name)
+
+
+def _suggest(node: Node, given: str) -> str:
+    """Return a hint with a similar name that is allowed; empty if there is none."""
+    similar = re.sub(r"[^a-zA-Z0-9_/]", "_", given)
+    similar = re.sub(r"/+", "/", similar).rstrip("/")
+    similar = re.sub(r"(^|/)(?=[0-9])", r"\1_", similar)
+    try:
+        _expand(node, similar)
+    except (InvalidServiceNameException, InvalidTopicNameException, ValueError):
+        return ""
+    return f"; {similar!r} is a valid one"

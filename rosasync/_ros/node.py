@@ -42,6 +42,7 @@ from rosasync._ros.failures import (
     RclpyError,
     check_up,
     is_up,
+    reason_of,
     refusal,
     topic_refusal,
     uses_node,
@@ -339,13 +340,15 @@ class RosNode:
         try:
             self._own_node = self._make_own(node, context)
         except InvalidNodeNameException as error:
-            reason = str(error).strip().replace("\n", " ")
+            reason = names.reason_of_name(error)
             raise ValueError(f"{node!r} is not a valid node name: {reason}") from None
         except UsageError:
             raise
         except RuntimeError as error:
             # RCLError, or what C++ throws if the process is out of file descriptors.
-            raise RosasyncError(f"rclpy cannot create the node {node!r}: {error}") from error
+            raise RosasyncError(
+                f"rclpy cannot create the node {node!r}: {reason_of(error)}"
+            ) from error
         return self._own_node
 
     def _make_own(self, name: str, given: Context | None) -> Node:

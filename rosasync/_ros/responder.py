@@ -27,7 +27,7 @@ from rosasync._ros.endpoints import (
     request_writers,
     response_readers,
 )
-from rosasync._ros.failures import RclpyError, explain, is_destroyed, uses_node
+from rosasync._ros.failures import RclpyError, explain, is_destroyed, reason_of, uses_node
 from rosasync._ros.fastdds import acknowledged
 from rosasync._ros.messages import make_message
 from rosasync.errors import RosasyncError
@@ -212,7 +212,7 @@ class Responder:
         if is_destroyed(self._handle):
             return explain(self._node, self._handle, error)
         # Not `Undeliverable`: it is the response that is at fault, not its client.
-        return RosasyncError(f"the middleware refuses the response: {error}")
+        return RosasyncError(f"the middleware refuses the response: {reason_of(error)}")
 
     def _check_visible(self, header: RequestHeader) -> None:
         """Raise if the graph does not show the client: the middleware dropped the response."""
