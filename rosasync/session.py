@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from rosasync._ros.node import RosNode
     from rosasync._server.handlers import ErrorHook, Handler, OverloadHook
     from rosasync._server.server import Order, ServiceServer
+    from rosasync._server.status import Status
     from rosasync.tracing import Trace
 
 __all__ = ["ServiceClient", "Session"]
@@ -445,6 +446,8 @@ class Session:
         qos: QoSProfile | None = None,
         on_error: ErrorHook[RequestT, ResponseT] | None = None,
         on_overload: OverloadHook[RequestT, ResponseT] | None = None,
+        status: Status = False,
+        cancel_abandoned: bool = False,
     ) -> ServiceServer[RequestT, ResponseT]: ...
 
     @overload
@@ -461,6 +464,8 @@ class Session:
         qos: QoSProfile | None = None,
         on_error: ErrorHook[Any, Any] | None = None,
         on_overload: OverloadHook[Any, Any] | None = None,
+        status: Status = False,
+        cancel_abandoned: bool = False,
     ) -> ServiceServer[Any, Any]: ...
 
     def serve(
@@ -476,6 +481,8 @@ class Session:
         qos: QoSProfile | None = None,
         on_error: ErrorHook[Any, Any] | None = None,
         on_overload: OverloadHook[Any, Any] | None = None,
+        status: Status = False,
+        cancel_abandoned: bool = False,
     ) -> ServiceServer[Any, Any]:
         """Serve a service from now until the server or the session is closed.
 
@@ -513,6 +520,12 @@ class Session:
             on_overload: ``on_overload(call)``, plain or async, called for a request that the
                 backlog drops. It may return the response to send. ``concurrency`` does not limit
                 it, so it should be quick.
+            status: True to tell callers at once that there will be no answer, if they use rosasync:
+                `HandlerFailed`, `ServerOverloaded` or `ServerGone`; and to learn which callers have
+                left, also of other clients whose process has gone from the graph. A request whose
+                caller has left is not run. ``"quiet"`` keeps the messages of exceptions here.
+            cancel_abandoned: whether to cancel the handler of a call whose caller has left. Needs
+                ``status``.
 
         Raises:
             TypeError: the handler is not callable, is a class, or takes neither one argument nor
@@ -534,6 +547,8 @@ class Session:
             qos=qos,
             on_error=on_error,
             on_overload=on_overload,
+            status=status,
+            cancel_abandoned=cancel_abandoned,
         )
 
     @overload

@@ -131,6 +131,8 @@ class ServerStatistics:
             not.
         dropped: calls left unanswered although no handler failed: beyond the backlog,
             garbage-collected, or unanswered when the server ended.
+        abandoned: requests whose caller had left: dropped while they waited, or whose handler was
+            cancelled. Always 0 without ``status=True``.
         undeliverable: responses whose client could not be reached, as far as the middleware shows.
     """
 
@@ -148,6 +150,7 @@ class ServerStatistics:
     failed: int = 0
     rejected: int = 0
     dropped: int = 0
+    abandoned: int = 0
     undeliverable: int = 0
 
 

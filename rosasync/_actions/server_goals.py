@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from rosasync._actions.goal_table import CancelSelection, GoalEvent, GoalRecord, GoalTable
 from rosasync._actions.status import GoalStatus
 from rosasync._actions.status_list import StatusList
+from rosasync._status.wire import Outcome
 from rosasync.errors import ContextShutdown, SessionClosed
 
 if TYPE_CHECKING:
@@ -179,7 +180,7 @@ class ServerGoals:
             return
         except Exception:
             logger.exception("%s: a result cannot be sent", self._name)
-            call.give_up("given up: its result cannot be sent", failed=True)
+            call.give_up("given up: its result cannot be sent", Outcome.FAILED, failed=True)
 
     def _arm(self) -> None:
         if self._timer is None and not self._closed and (due := self._table.expiry()) is not None:

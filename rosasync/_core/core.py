@@ -23,6 +23,7 @@ from rosasync._core.arguments import ArgumentChecker
 from rosasync._core.gateway import LoopGateway
 from rosasync._core.portal import Portal
 from rosasync._server.server import ServiceServer
+from rosasync._status.reporter import Reporter
 from rosasync.errors import ContextShutdown, SessionClosed, UsageError
 from rosasync.tracing import Tracing
 
@@ -70,6 +71,7 @@ class Core:
         self.portal = Portal(
             self.node, self.gateway, self.arguments, self.pool, self.actions, options.timeout
         )
+        self.reporter = Reporter(self.node)
         # A server removes itself when it ends, by its `on_end`.
         self.servers: dict[ServiceServer[Any, Any], None] = {}
         # The same. Their services are among the servers.
@@ -116,6 +118,7 @@ class Core:
             handler,
             on_end=self.servers.pop,
             tracing=self.tracing,
+            reporter=self.reporter,
             **options,
         )
         self.servers[server] = None
@@ -232,8 +235,9 @@ class Core:
 
     def _graph_changed(self) -> None:
         self.pool.graph_changed()
+        self.reporter.on_graph()
         for server in tuple(self.servers):
-            server.check_port()
+            server.on_graph()
         for action_server in tuple(self.action_servers):
             action_server.check_ports()
         try:

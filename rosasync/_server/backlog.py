@@ -162,6 +162,16 @@ class Backlog(Generic[T]):
         self._measure(now)
         return waiting.item
 
+    def remove(self, item: T) -> bool:
+        """Remove a request, because its caller has left; return whether it was there."""
+        for waiting in self._requests.values():
+            if waiting.item is item:
+                self._remove(waiting)
+                if not self._requests:
+                    self._popped_at = None
+                return True
+        return False
+
     def clear(self) -> Sequence[T]:
         """Remove all requests, and return them in the order of their arrival."""
         items = [waiting.item for waiting in self._requests.values()]
@@ -215,11 +225,13 @@ class Backlog(Generic[T]):
         self._size -= waiting.size
         owner = self._clients[waiting.client]
         owner.size -= waiting.size
-        # It is the oldest or the newest of its client: others are never chosen.
+        # Mostly it is the oldest or the newest of its client.
         if owner.requests[0] is waiting:
             owner.requests.popleft()
-        else:
+        elif owner.requests[-1] is waiting:
             owner.requests.pop()
+        else:
+            owner.requests.remove(waiting)
         if not owner.requests:
             del self._clients[waiting.client]
             if self.standing and self._turns is not None:

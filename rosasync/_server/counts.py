@@ -11,11 +11,12 @@ __all__ = ["CallCounts"]
 class CallCounts:
     """What has happened to the calls of a server.
 
-    The first four are changed on the loop's thread, the others under the sender's lock.
+    The first five are changed on the loop's thread, the others under the sender's lock.
     """
 
     taken: int = 0
     rejected: int = 0
+    abandoned: int = 0
     deferred: int = 0
     failed: int = 0
     responded: int = 0

@@ -16,7 +16,7 @@ class Spawn(Protocol):
 
     def __call__(
         self, work: Coroutine[Any, Any, None], on_cancelled: Callable[[], object], /
-    ) -> None:
+    ) -> object:
         """Run a coroutine in a task."""
 
 
@@ -47,8 +47,8 @@ class HandlerTasks:
         work: Coroutine[Any, Any, None],
         on_cancelled: Callable[[], object] = lambda: None,
         context: Context | None = None,
-    ) -> None:
-        """Run a coroutine in a task.
+    ) -> asyncio.Task[None]:
+        """Run a coroutine in a task, and return it.
 
         Args:
             work: the coroutine. It sees to its own cancellation once it has begun.
@@ -63,6 +63,7 @@ class HandlerTasks:
             self._tasks.add(task)
             # A task that is cancelled before its first step does not enter `_run`.
             task.add_done_callback(functools.partial(self._check_begun, work, on_cancelled))
+        return task
 
     def exclude_caller(self) -> None:
         """Do not wait for the handler whose task calls this, or started the task that does."""

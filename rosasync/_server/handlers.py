@@ -17,6 +17,7 @@ from rosasync._server.counts import CallCounts
 from rosasync._server.handler_tasks import HandlerTasks
 from rosasync._server.sending import ResponseSender
 from rosasync._server.service_call import ServiceCall
+from rosasync._status.wire import Outcome
 from rosasync.errors import ContextShutdown, SessionClosed
 from rosasync.typing import RequestT, ResponseT
 
@@ -129,11 +130,13 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
                 self._finish(call, result)
             else:
                 in_task = True
-                self._tasks.spawn(
+                task = self._tasks.spawn(
                     self._await_handler(call, self._blocking.timed(result)),
                     lambda: self._never_ran(call, result),
                     context,
                 )
+                if call.status is not None:
+                    call.status.task = task
         except BaseException as error:
             self._contain(call, error, self._fail)
         finally:
@@ -211,9 +214,11 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
         if isinstance(pending, Coroutine):
             # Otherwise Python warns that it was never awaited.
             pending.close()
-        call.give_up("given up: its handler was cancelled")
+        ended = Outcome.FAILED if self._sender.ending is None else Outcome.CLOSED
+        call.give_up("given up: its handler was cancelled", ended, error=asyncio.CancelledError())
         if not call.responded:
-            logger.warning(
+            logger.log(
+                logging.DEBUG if call.abandoned else logging.WARNING,
                 "%s: the handler of %r was cancelled, so its client gets no response",
                 self._sender.name,
                 call,
@@ -313,7 +318,7 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
             "" if call.settled else ", so its client gets no response",
             exc_info=error,
         )
-        call.give_up("given up: its handler failed", failed=True)
+        call.give_up("given up: its handler failed", Outcome.FAILED, failed=True, error=error)
 
     def _fail_hook(self, call: ServiceCall[RequestT, ResponseT], error: Exception) -> None:
         logger.error(

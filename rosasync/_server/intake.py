@@ -80,6 +80,10 @@ class Intake(Generic[RequestT, ResponseT]):
         self._log.update(backlog.standing, 0, len(backlog), backlog.oldest_age(now))
         return call
 
+    def remove(self, call: ServiceCall[RequestT, ResponseT]) -> bool:
+        """Remove a call that waits, and return whether it did."""
+        return self._backlog.remove(call)
+
     async def get(self) -> ServiceCall[RequestT, ResponseT] | None:
         """Wait for a call; None if the intake is closed."""
         self._getting += 1

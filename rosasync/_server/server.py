@@ -27,14 +27,17 @@ from rosasync._server.intake import Intake
 from rosasync._server.overload import OverloadLog
 from rosasync._server.sending import ResponseSender, service_destroyed
 from rosasync._server.service_call import RequestInfo, ServiceCall
+from rosasync._server.status import ServerStatus, Status, check_status
+from rosasync._status.wire import Outcome
 from rosasync.errors import SessionClosed, UsageError
-from rosasync.options import check_count, check_timeout
+from rosasync.options import check_count, check_flag, check_timeout
 from rosasync.statistics import ServerStatistics
 from rosasync.tracing import ServerTracing
 from rosasync.typing import RequestT, ResponseT
 
 if TYPE_CHECKING:
     from rosasync._core.ports import NodePort, RequestHeader
+    from rosasync._status.reporter import Reporter
     from rosasync.tracing import Tracing
 
 __all__ = ["Handler", "Order", "RequestInfo", "ServiceCall", "ServiceServer"]
@@ -83,8 +86,11 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         qos: Any,
         on_error: ErrorHook[RequestT, ResponseT] | None,
         on_overload: OverloadHook[RequestT, ResponseT] | None,
+        status: Status,
+        cancel_abandoned: bool,
         on_end: Callable[[ServiceServer[RequestT, ResponseT]], object],
         tracing: Tracing,
+        reporter: Reporter,
     ) -> None:
         self._loop = asyncio.get_running_loop()
         kind = settle_kind(handler)
@@ -98,6 +104,9 @@ class ServiceServer(Generic[RequestT, ResponseT]):
             check_count("backlog_bytes", backlog_bytes, 0),
         )
         by_arrival = _check_order(order) == "arrival"
+        check_status(status)
+        check_flag("cancel_abandoned", cancel_abandoned)
+        self._cancel_abandoned = cancel_abandoned
         self._counts = CallCounts()
         self._tasks = HandlerTasks()
         self._taking = True
@@ -129,6 +138,15 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         self._runner = HandlerRunner(
             kind, on_error, self._sender, self._counts, self._tasks, self._start_waiting
         )
+        self._status: ServerStatus | None = None
+        if status:
+            self._status = ServerStatus(
+                self._name,
+                self._port,
+                reporter,
+                quiet=status == "quiet",
+                on_abandoned=self._on_abandoned,
+            )
 
     def __repr__(self) -> str:
         counts = f"{self._runner.running} running, {len(self._intake)} waiting"
@@ -224,6 +242,7 @@ class ServiceServer(Generic[RequestT, ResponseT]):
             rejected=counts.rejected,
             dropped=counts.dropped,
             undeliverable=counts.undeliverable,
+            abandoned=counts.abandoned,
         )
 
     async def aclose(self, timeout: float | None = CLOSE_TIMEOUT) -> None:
@@ -258,13 +277,16 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         """
         self._tasks.exclude_caller()
 
-    def check_port(self) -> None:
+    def on_graph(self) -> None:
         """End the server if something other than rosasync has destroyed its rclpy service.
 
-        For the session, whenever the graph changes. On the loop's thread.
+        Otherwise look for clients that have left. For the session, whenever the graph changes. On
+        the loop's thread.
         """
         if self._port.destroyed:
             self._on_destroyed()
+        elif self._status is not None:
+            self._status.on_graph()
 
     def end(self, ending: Callable[[], Exception]) -> None:
         """End at once; idempotent.
@@ -280,6 +302,9 @@ class ServiceServer(Generic[RequestT, ResponseT]):
             self._drop_waiting()
             self._overload.close()
             self._sender.close(ending)
+            if self._status is not None:
+                # After the last response, because no answered call may be reported.
+                self._status.close()
             self._traces.close()
             self._port.close()
             if not self._loop.is_closed():
@@ -299,6 +324,9 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         now = monotonic_ns()
         trace = self._traces.start(now) if now >= self._tracing.quiet_until else None
         call = ServiceCall(self, request, header, self._sender, now, trace)
+        if self._status is not None:
+            number = header.request_id.sequence_number
+            call.status = self._status.take(call, self._port.client_of(header), number)
         if not self._intake and self._can_start:
             # It has not waited.
             self._backlog.last_age = 0.0
@@ -347,7 +375,18 @@ class ServiceServer(Generic[RequestT, ResponseT]):
             self._runner.call_hook(call, self._on_overload, (call,), self._give_up_dropped)
 
     def _give_up_dropped(self, call: ServiceCall[RequestT, ResponseT]) -> None:
-        call.give_up("dropped: too many requests were waiting")
+        call.give_up("dropped: too many requests were waiting", Outcome.DROPPED)
+
+    def _on_abandoned(self, call: ServiceCall[RequestT, ResponseT]) -> None:
+        """Drop a call whose caller has left, or cancel its handler if that is wished."""
+        if self._intake.remove(call):
+            self._counts.abandoned += 1
+            call.give_up("dropped: its caller has left", Outcome.DROPPED)
+            return
+        task = call.status.task if call.status is not None else None
+        if self._cancel_abandoned and task is not None:
+            self._counts.abandoned += 1
+            task.cancel()
 
     # Ending.
 
@@ -375,7 +414,7 @@ class ServiceServer(Generic[RequestT, ResponseT]):
                 len(waiting),
             )
         for call in waiting:
-            call.give_up("dropped: the server was closed")
+            call.give_up("dropped: the server was closed", Outcome.CLOSED)
 
     async def _end(self, timeout: float | None) -> None:
         deadline = None if timeout is None else self._loop.time() + timeout

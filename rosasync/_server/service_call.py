@@ -9,10 +9,12 @@ from time import monotonic_ns
 from typing import TYPE_CHECKING, Any, Generic, Protocol
 
 from rosasync._server.sending import ResponseSender
+from rosasync._status.wire import Outcome
 from rosasync.typing import RequestT, ResponseT
 
 if TYPE_CHECKING:
     from rosasync._core.ports import RequestHeader
+    from rosasync._server.call_status import CallStatus
     from rosasync.statistics import ServerStatistics
     from rosasync.tracing import ServerTrace
 
@@ -89,6 +91,7 @@ class ServiceCall(Generic[RequestT, ResponseT]):
         "_sender",
         "request",
         "server",
+        "status",
         "trace",
     )
 
@@ -111,6 +114,8 @@ class ServiceCall(Generic[RequestT, ResponseT]):
         self._received = received
         # For the server and its sender, which report what happens to the call.
         self.trace = trace
+        # The same, if the server tells its callers. Set by the server.
+        self.status: CallStatus | None = None
 
     def __repr__(self) -> str:
         number = self._header.request_id.sequence_number
@@ -118,6 +123,8 @@ class ServiceCall(Generic[RequestT, ResponseT]):
 
     def __del__(self) -> None:
         if self._outcome is None and self._sender.count_collected(self.trace):
+            if self.status is not None:
+                self.status.report(Outcome.FAILED)
             warnings.warn(
                 f"{self._sender.name}: a call was dropped unanswered, so its client waits in vain: "
                 "keep the call, and call its respond() once",
@@ -153,6 +160,11 @@ class ServiceCall(Generic[RequestT, ResponseT]):
         """Whether it has been answered or given up."""
         return self._outcome is not None
 
+    @property
+    def abandoned(self) -> bool:
+        """Whether its caller has left. Always False unless the server has ``status=True``."""
+        return self.status is not None and self.status.abandoned
+
     def respond(self, response: ResponseT | Mapping[str, Any]) -> None:
         """Convert the response and send it, at once and in the calling thread.
 
@@ -184,12 +196,21 @@ class ServiceCall(Generic[RequestT, ResponseT]):
             self._outcome = None
             raise
 
-    def give_up(self, reason: str, *, failed: bool = False) -> bool:
+    def give_up(
+        self,
+        reason: str,
+        outcome: Outcome = Outcome.FAILED,
+        *,
+        failed: bool = False,
+        error: BaseException | None = None,
+    ) -> bool:
         """Leave the request unanswered for good. From any thread.
 
         Args:
             reason: the outcome for the error of a later `respond`, such as "dropped: …".
+            outcome: what its caller is told, if the server has ``status=True``.
             failed: whether its handler failed. If not, the call is counted as dropped.
+            error: what the handler raised.
 
         Returns:
             Whether this settled the call. False if it is settled already, or the server has ended.
@@ -202,6 +223,8 @@ class ServiceCall(Generic[RequestT, ResponseT]):
             sender.count_unanswered(failed=failed)
         if self.trace is not None:
             self.trace.end_unanswered()
+        if self.status is not None:
+            self.status.report(outcome, error)
         return True
 
 
