@@ -199,7 +199,7 @@ class CallService(ServiceBehaviour[RequestT, ResponseT]):
         on_error: Callable[[Exception], Status | None] | None = None,
         on_feedback: Callable[[str], object] | None = None,
         timeout: Timeout = ...,
-        wait: bool = True,
+        wait: bool | float = True,
         retry: Retry | None = None,
         qos: QoSProfile | None = None,
         session: Session | None = None,

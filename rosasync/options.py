@@ -25,6 +25,7 @@ __all__ = [
     "check_retry",
     "check_seconds",
     "check_timeout",
+    "check_wait",
 ]
 
 
@@ -44,16 +45,29 @@ def check_seconds(name: str, value: SupportsFloat) -> float:
 def check_timeout(value: Timeout, default: float | None) -> float | None:
     """Return a timeout in seconds, or None for no deadline; ``...`` gives ``default``.
 
+    A negative timeout gives 0: it is the time that is left until a deadline, and it has run out.
+
     Raises:
         TypeError: it is not a number.
-        ValueError: it is negative, not a number (NaN), or too large for a float.
+        ValueError: it is not a number (NaN), or too large for a float.
     """
     if value is ...:
         return default
     if value is None:
         return None
-    seconds = check_seconds("timeout", value)
-    return None if seconds == math.inf else seconds
+    seconds = _as_float("timeout", value, "a number of seconds")
+    return None if seconds == math.inf else max(0.0, seconds)
+
+
+def check_wait(value: object) -> None:
+    """Check whether, or for how many seconds, to wait for a server.
+
+    Raises:
+        TypeError: it is neither a bool nor a number.
+        ValueError: it is not a number (NaN), or too large for a float.
+    """
+    if not isinstance(value, bool):
+        _as_float("wait", value, "True, False or a number of seconds")  # type: ignore[arg-type]
 
 
 def check_count(name: str, value: SupportsIndex, least: int) -> int:
@@ -216,6 +230,8 @@ class SessionOptions:
             )
         if not isinstance(self.limits, Limits):
             raise TypeError(f"limits must be a rosasync.Limits, not {type(self.limits).__name__}")
+        if self.timeout is not None:
+            check_seconds("timeout", self.timeout)
         _set(self, "timeout", check_timeout(self.timeout, None))
         _set(self, "busy_poll", check_seconds("busy_poll", self.busy_poll))
         check_trace(self.trace)

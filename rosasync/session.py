@@ -235,7 +235,7 @@ class Session:
         *,
         timeout: Timeout = ...,
         qos: QoSProfile | None = None,
-        wait: bool = True,
+        wait: bool | float = True,
         retry: Retry | None = None,
     ) -> ResponseT: ...
 
@@ -248,7 +248,7 @@ class Session:
         *,
         timeout: Timeout = ...,
         qos: QoSProfile | None = None,
-        wait: bool = True,
+        wait: bool | float = True,
         retry: Retry | None = None,
     ) -> Any: ...
 
@@ -260,7 +260,7 @@ class Session:
         *,
         timeout: Timeout = ...,
         qos: QoSProfile | None = None,
-        wait: bool = True,
+        wait: bool | float = True,
         retry: Retry | None = None,
     ) -> Any:
         """Call a service and return its response.
@@ -273,10 +273,12 @@ class Session:
             request: a message of the request type, a mapping of its fields, or None for an empty
                 one. It is read when it is sent: do not change it before the response.
             timeout: seconds for the whole call, None for no deadline; if left out, the session's.
+                If none are left (0 or less), nothing is sent, and the call raises `QueueTimeout`.
             qos: a ``QoSProfile``; None for the service default with a history of 1,000, or of
                 ``Limits.in_flight``, at least 10, without rosasync's Fast DDS profile.
-            wait: False to fail at once if there is no server, or none of this type. A call that
-                waits while the name is served as another type logs a warning after one second.
+            wait: False to fail at once if there is no server, or none of this type; a number of
+                seconds to wait for one within the timeout. A call that waits while the name is
+                served as another type logs a warning after one second.
             retry: when to send an unanswered request again; only for services that may run twice.
 
         Raises:
@@ -308,7 +310,7 @@ class Session:
         *,
         timeout: Timeout = ...,
         qos: QoSProfile | None = None,
-        wait: bool = True,
+        wait: bool | float = True,
         retry: Retry | None = None,
     ) -> asyncio.Task[ResponseT]: ...
 
@@ -321,7 +323,7 @@ class Session:
         *,
         timeout: Timeout = ...,
         qos: QoSProfile | None = None,
-        wait: bool = True,
+        wait: bool | float = True,
         retry: Retry | None = None,
     ) -> asyncio.Task[Any]: ...
 
@@ -333,7 +335,7 @@ class Session:
         *,
         timeout: Timeout = ...,
         qos: QoSProfile | None = None,
-        wait: bool = True,
+        wait: bool | float = True,
         retry: Retry | None = None,
     ) -> asyncio.Task[Any]:
         """Start the same call as a task, for a tick to poll and cancel.
@@ -917,7 +919,7 @@ class ServiceClient(Generic[RequestT, ResponseT]):
         request: RequestT | Mapping[str, Any] | None = None,
         *,
         timeout: Timeout = ...,
-        wait: bool = True,
+        wait: bool | float = True,
         retry: Retry | None = None,
     ) -> ResponseT:
         """Call the service; see `Session.call`."""
@@ -935,7 +937,7 @@ class ServiceClient(Generic[RequestT, ResponseT]):
         request: RequestT | Mapping[str, Any] | None = None,
         *,
         timeout: Timeout = ...,
-        wait: bool = True,
+        wait: bool | float = True,
         retry: Retry | None = None,
     ) -> asyncio.Task[ResponseT]:
         """Start the same call as a task; see `Session.start`."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import subprocess
 import sys
 import threading
@@ -519,10 +520,10 @@ class TestSetup:
     def test_bad_options(self) -> None:
         with pytest.raises(TypeError, match="not both"):
             CallService("a", ECHO, NAME, request_of("a"), key_request="request")
-        with pytest.raises(ValueError, match="negative"):
-            CallService("a", ECHO, NAME, timeout=-1.0)
-        with pytest.raises(ValueError, match="negative"):
-            WaitForService("a", ECHO, NAME, timeout=-1.0)
+        with pytest.raises(ValueError, match="NaN"):
+            CallService("a", ECHO, NAME, timeout=math.nan)
+        with pytest.raises(ValueError, match="NaN"):
+            WaitForService("a", ECHO, NAME, timeout=math.nan)
 
     async def test_shutdown_cancels_and_setup_begins_anew(
         self, graph: FakeGraph, fake_session: Session

@@ -198,7 +198,7 @@ async def test_names_and_timeouts(session: Session) -> None:
     with pytest.raises(rosasync.InvalidServiceName):
         LifecycleClient(session, "/no spaces")
     with pytest.raises(ValueError, match="timeout"):
-        LifecycleClient(session, "/arm", timeout=-1.0)
+        LifecycleClient(session, "/arm", timeout=float("nan"))
 
 
 @pytest.mark.parametrize("kind", [TransitionError, TransitionFailed, TransitionTimeout])

@@ -312,7 +312,7 @@ class TestMisuse:
             (TypeError, (ECHO, 5), {}),
             (TypeError, (ECHO, NAME, "no request"), {}),
             (ValueError, (ECHO, NAME, {"no_field": 1}), {}),
-            (ValueError, (ECHO, NAME), {"timeout": -1.0}),
+            (ValueError, (ECHO, NAME), {"timeout": float("nan")}),
             (TypeError, (ECHO, NAME), {"timeout": "soon"}),
             (TypeError, (ECHO, NAME), {"qos": 10}),
             (TypeError, (ECHO, NAME), {"retry": 3}),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import threading
 from typing import TYPE_CHECKING, Any
 
@@ -443,13 +444,15 @@ class TestBadInput:
             session.service_is_ready(ECHO, name)
 
     @pytest.mark.parametrize("timeout", [-1, -0.001, float("nan")])
-    async def test_a_negative_timeout(self, session: Session, echo: str, timeout: float) -> None:
-        with pytest.raises(ValueError, match="timeout"):
-            await session.call(ECHO, echo, timeout=timeout)
-        with pytest.raises(ValueError, match="timeout"):
-            await session.wait_for_service(ECHO, echo, timeout=timeout)
+    def test_a_default_timeout_that_has_run_out(self, timeout: float) -> None:
         with pytest.raises(ValueError, match="timeout"):
             Session(timeout=timeout)
+
+    async def test_a_timeout_that_is_not_a_number(self, session: Session, echo: str) -> None:
+        with pytest.raises(ValueError, match="timeout"):
+            await session.call(ECHO, echo, timeout=math.nan)
+        with pytest.raises(ValueError, match="timeout"):
+            await session.wait_for_service(ECHO, echo, timeout=math.nan)
 
     @pytest.mark.parametrize("timeout", ["1", True, object()])
     async def test_a_timeout_that_is_no_number(

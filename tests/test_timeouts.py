@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from collections.abc import Callable, Coroutine
 from typing import Any
 
@@ -11,9 +12,17 @@ import pytest
 from py_trees.behaviour import Behaviour
 from py_trees.common import Status
 
-from rosasync import AsyncServiceProxy, ProxyState, Session
+from rosasync import (
+    AsyncServiceProxy,
+    CallError,
+    Limits,
+    ProxyState,
+    QueueTimeout,
+    ServiceUnavailable,
+    Session,
+)
 from rosasync.behaviours import CallService, WaitForService
-from rosasync.lifecycle import LifecycleClient
+from rosasync.lifecycle import LifecycleClient, TransitionTimeout
 from rosasync.parameters import ParameterClient
 from rosasync.testing import FakeGraph
 from tests.support.echo import ECHO, service_class
@@ -212,3 +221,77 @@ async def test_a_session_without_a_timeout_has_none(graph: FakeGraph, way: Way) 
         assert not task.done()
         task.cancel()
     await asyncio.wait([task])
+
+
+@pytest.mark.parametrize("timeout", [0, -0.001, -math.inf])
+@pytest.mark.parametrize(
+    ("way", "error"),
+    [*((way, QueueTimeout) for way in CALLS), *((way, ServiceUnavailable) for way in WAITS)],
+)
+async def test_without_any_time_left_nothing_is_sent(
+    graph: FakeGraph, way: Way, error: type[CallError], timeout: float
+) -> None:
+    (server,) = graph.servers
+    async with graph.session() as session, asyncio.timeout(LIMIT):
+        with pytest.raises((error, TransitionTimeout)):
+            await way(session, timeout=timeout)
+        assert server.received == []
+        assert [port.sent for node in graph.nodes for port in node.clients if port.sent] == []
+
+
+@pytest.mark.parametrize("timeout", [0, -1.0])
+async def test_a_wait_without_any_time_left_for_a_server_that_is_there(
+    graph: FakeGraph, timeout: float
+) -> None:
+    async with graph.session() as session:
+        await session.wait_for_service(ECHO, SILENT)
+        assert await session.wait_for_service(ECHO, SILENT, timeout=timeout)
+        await session.client(ECHO, SILENT).wait(timeout)
+
+
+@pytest.mark.parametrize(
+    "way", [session_call, session_start, client_call, client_start, portal_call]
+)
+async def test_a_wait_for_a_server_of_some_seconds(graph: FakeGraph, way: Way) -> None:
+    async with graph.session(timeout=None) as session, asyncio.timeout(LIMIT):
+        with pytest.raises(ServiceUnavailable):
+            await way(session, wait=TICK)
+
+
+async def test_a_server_that_comes_within_the_wait_gets_the_call(fake_graph: FakeGraph) -> None:
+    async with fake_graph.session() as session:
+        first = session.start(ECHO, "/echo", wait=LIMIT)
+        second = session.start(ECHO, "/echo")
+        await asyncio.sleep(TICK)
+        server = fake_graph.serve(ECHO, "/echo", lambda request: service_class(ECHO).Response())
+        await asyncio.gather(first, second)
+        assert len(server.received) == 2
+
+
+async def test_the_wait_for_a_server_does_not_bound_the_wait_for_a_place(
+    fake_graph: FakeGraph,
+) -> None:
+    server = fake_graph.serve(ECHO, "/echo", lambda request: service_class(ECHO).Response())
+    async with fake_graph.session(limits=Limits(in_flight=1), timeout=LIMIT) as session:
+        with fake_graph.hold_requests():
+            calls = [session.start(ECHO, "/echo", wait=TICK) for _ in range(3)]
+            await asyncio.sleep(3 * TICK)
+            assert not any(call.done() for call in calls)
+        await asyncio.gather(*calls)
+    assert len(server.received) == 3
+
+
+@pytest.mark.parametrize("wait", [0, 0.0, -1.0, False])
+async def test_no_wait_for_a_server_at_all(fake_graph: FakeGraph, wait: float) -> None:
+    async with fake_graph.session(timeout=None) as session, asyncio.timeout(LIMIT):
+        with pytest.raises(ServiceUnavailable):
+            await session.call(ECHO, "/echo", wait=wait)
+
+
+@pytest.mark.parametrize(("wait", "error"), [(math.nan, ValueError), ("1", TypeError)])
+async def test_a_wait_that_is_not_a_number(
+    fake_graph: FakeGraph, wait: Any, error: type[Exception]
+) -> None:
+    async with fake_graph.session() as session:
+        with pytest.raises(error, match="wait"):
+            await session.call(ECHO, "/echo", wait=wait)

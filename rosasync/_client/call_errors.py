@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rosasync._client.retry import Plan
     from rosasync._core.ports import NodePort, Service
 
-__all__ = ["AllServersGone", "CallErrors"]
+__all__ = ["AllServersGone", "CallErrors", "NoServer"]
 
 
 SHARED = 20
@@ -29,6 +29,10 @@ SHARED = 20
 
 class AllServersGone(Exception):
     """Every server that had a request has vanished. Callers get `ServerGone` for it."""
+
+
+class NoServer(Exception):
+    """There was no server for as long as the call may wait for one."""
 
 
 class CallErrors:
@@ -47,6 +51,11 @@ class CallErrors:
         seen = self._explain_missing()
         message = f"no server for {self._service.key.srv_type} after {elapsed:.3g} s; {seen}"
         return self._make(ServiceUnavailable, message, elapsed)
+
+    def no_time_left(self) -> CallError:
+        """Return the error for a call that begins with no time left."""
+        message = "no time was left when the call was made (timeout=0 or less): nothing was sent"
+        return self._make(QueueTimeout, message, 0.0)
 
     def queue_timeout(self, elapsed: float, in_flight: int, abandoned: int) -> CallError:
         """Return the error for a call that found a server, but no free client."""

@@ -12,7 +12,7 @@ from time import monotonic, monotonic_ns
 from typing import TYPE_CHECKING, Any
 
 from rosasync._client.call import Call
-from rosasync._client.call_errors import AllServersGone, CallErrors
+from rosasync._client.call_errors import AllServersGone, CallErrors, NoServer
 from rosasync._client.counts import Counts
 from rosasync._client.dispatch import Dispatch, LeaseWaiter
 from rosasync._client.latency import LatencyHistogram, summarize
@@ -119,7 +119,7 @@ class ServicePool:
         self,
         request: Any,
         timeout: float | None,
-        wait: bool = True,
+        wait: bool | float = True,
         retry: Retry | None = None,
         *,
         lease: Client | None = None,
@@ -131,7 +131,7 @@ class ServicePool:
         Args:
             request: the message.
             timeout: seconds for the whole call, None for no deadline.
-            wait: whether to wait for a server if there is none.
+            wait: whether to wait for a server if there is none, or for how many seconds.
             retry: when to send again.
             lease: the leased client to send with. The call uses the place of the lease.
             copy: copy the request, unless it is sent in this turn of the loop and never again.
@@ -150,8 +150,11 @@ class ServicePool:
         deadline = None if timeout is None else started + timeout
         plan = None if retry is None else Plan(retry, self._budget)
         call = Call(dispatch, loop.create_future(), request, plan, lease, trace, is_cancelled)
-        entry = None
+        entry = server_timer = None
         try:
+            if timeout is not None and timeout <= 0:
+                self.check_open()
+                raise self._errors.no_time_left()
             if lease is not None:
                 self.check_open()
                 dispatch.start_leased(call, started)
@@ -165,8 +168,11 @@ class ServicePool:
                 else:
                     if trace is not None:
                         self._traces.wait(trace, self._clients.lacks_server)
-                    if not wait:
-                        await self._find_server(started, deadline)
+                    if wait is not True:
+                        if wait <= 0:
+                            await self._find_server(started, deadline)
+                        else:
+                            server_timer = loop.call_at(started + wait, self._give_up_server, call)
                     self.check_open()
                     dispatch.enqueue(call)
             if deadline is not None:
@@ -178,6 +184,8 @@ class ServicePool:
             # Not a method of `Deadlines`, because every call comes here.
             if entry is not None:
                 entry[-1] = None
+            if server_timer is not None:
+                server_timer.cancel()
             # First, because the end of the call may schedule an assignment of what still waits.
             if plan is not None or not call.started:
                 dispatch.remove(call)
@@ -193,7 +201,7 @@ class ServicePool:
         self,
         request: Any,
         timeout: float | None,
-        wait: bool = True,
+        wait: bool | float = True,
         retry: Retry | None = None,
         *,
         copy: bool = False,
@@ -221,6 +229,8 @@ class ServicePool:
         """
         started = self._loop.time()
         self.check_open()
+        if timeout is not None and timeout <= 0:
+            raise self._errors.no_time_left()
         dispatch = self._dispatch
         idle = not (dispatch.queue or dispatch.resends)
         client = self._clients.choose() if idle else None
@@ -332,6 +342,11 @@ class ServicePool:
             await self._dispatch.wait_for_match(client, deadline)
             self.check_open()
 
+    def _give_up_server(self, call: Call) -> None:
+        """End a call that has waited for a server as long as it may, unless one is matched."""
+        if not call.started and not call.future.done() and not self._clients.any_ready():
+            call.future.set_exception(NoServer())
+
     async def _find_server(self, started: float, deadline: float | None) -> None:
         """Raise `ServiceUnavailable` if the graph shows no server; otherwise wait for the match."""
         if self.match():
@@ -382,6 +397,8 @@ class ServicePool:
         match error:
             case asyncio.CancelledError() | RosasyncError():
                 return error
+            case NoServer():
+                return self._errors.unavailable(elapsed)
             case Expired() if not call.started:
                 return self._unreached(started)
             case Expired():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from rosasync.options import check_flag, check_retry, check_timeout
+from rosasync.options import check_retry, check_timeout, check_wait
 
 if TYPE_CHECKING:
     from rosasync._core.ports import NodePort, Service
@@ -39,7 +39,7 @@ class ArgumentChecker:
         request: Any,
         timeout: Timeout,
         default: float | None,
-        wait: bool = True,
+        wait: bool | float = True,
         retry: Retry | None = None,
     ) -> tuple[Any, float | None]:
         """Return the message to send, and the timeout in seconds (None for no deadline).
@@ -49,7 +49,7 @@ class ArgumentChecker:
             request: a message, a mapping of its fields, or None for an empty one.
             timeout: what the caller passed.
             default: the timeout to use if the caller passed none.
-            wait: checked to be a bool.
+            wait: checked to be a bool or a number of seconds.
             retry: checked to be a `Retry` or None.
 
         Raises:
@@ -62,5 +62,5 @@ class ArgumentChecker:
         if retry is not None:
             check_retry(retry)
         if wait is not True:
-            check_flag("wait", wait)
+            check_wait(wait)
         return request, default

@@ -87,7 +87,7 @@ class Portal:
         *,
         timeout: Timeout = ...,
         qos: QoSProfile | None = None,
-        wait: bool = True,
+        wait: bool | float = True,
         retry: Retry | None = None,
     ) -> ResponseT: ...
 
@@ -100,7 +100,7 @@ class Portal:
         *,
         timeout: Timeout = ...,
         qos: QoSProfile | None = None,
-        wait: bool = True,
+        wait: bool | float = True,
         retry: Retry | None = None,
     ) -> Any: ...
 
@@ -112,7 +112,7 @@ class Portal:
         *,
         timeout: Timeout = ...,
         qos: QoSProfile | None = None,
-        wait: bool = True,
+        wait: bool | float = True,
         retry: Retry | None = None,
     ) -> Any:
         """Call a service, block this thread until the response arrives, and return it.
@@ -138,7 +138,7 @@ class Portal:
         *,
         timeout: Timeout = ...,
         qos: QoSProfile | None = None,
-        wait: bool = True,
+        wait: bool | float = True,
         retry: Retry | None = None,
     ) -> Future[ResponseT]: ...
 
@@ -151,7 +151,7 @@ class Portal:
         *,
         timeout: Timeout = ...,
         qos: QoSProfile | None = None,
-        wait: bool = True,
+        wait: bool | float = True,
         retry: Retry | None = None,
     ) -> Future[Any]: ...
 
@@ -163,7 +163,7 @@ class Portal:
         *,
         timeout: Timeout = ...,
         qos: QoSProfile | None = None,
-        wait: bool = True,
+        wait: bool | float = True,
         retry: Retry | None = None,
     ) -> Future[Any]:
         """Start the same call and return at once. Cancelling the future cancels the call.
@@ -255,7 +255,7 @@ class Portal:
         request: Any,
         timeout: Timeout,
         qos: QoSProfile | None,
-        wait: bool,
+        wait: bool | float,
         retry: Retry | None,
         copy: bool = False,
     ) -> _Submission:

@@ -140,7 +140,7 @@ class AsyncServiceProxy(Generic[RequestT, ResponseT]):
         request: RequestT | Mapping[str, Any] | None = None,
         timeout: Timeout = ...,
         *,
-        wait: bool = True,
+        wait: bool | float = True,
     ) -> None:
         """Start a call, which replaces the previous operation. The state becomes RUNNING.
 
@@ -313,7 +313,7 @@ class _Operation:
         state: ProxyState,
         request: Any = None,
         timeout: float | None = None,
-        wait: bool = True,
+        wait: bool | float = True,
     ) -> None:
         self.state = state
         self.request = request

@@ -362,7 +362,7 @@ async def test_a_leased_call_whose_place_comes_in_the_turn_of_the_end_is_not_sen
     ):
         client = the_client(fake_graph)
         with fake_graph.drop_responses(), pytest.raises(ResponseTimeout):
-            await leased.call(Echo.Request(1), timeout=0.0)
+            await leased.call(Echo.Request(1), timeout=TICK / 10)
         waiting = asyncio.create_task(leased.call(Echo.Request(2), timeout=None))
         await asyncio.sleep(0)
         # The late response gives the place back, and the next turn would send the second request.
@@ -431,7 +431,7 @@ async def test_a_call_whose_error_cannot_be_explained_is_counted(fake_graph: Fak
 
         node.explain_missing = explain_missing
         with pytest.raises(ContextShutdown):
-            await ask(session, 1, timeout=0.0)
+            await ask(session, 1, timeout=TICK / 10)
         assert session.pool.statistics().failed == 1
 
 
