@@ -276,3 +276,21 @@ async def test_a_response_that_cannot_be_sent_can_be_replaced(session: Session) 
             break
         assert (await task).success is True
         assert server.statistics().responded == 1
+
+
+async def test_a_handlers_response_that_cannot_be_sent_goes_to_on_error(session: Session) -> None:
+    errors = []
+
+    def handler(request: Any, response: Any) -> Any:
+        response.success = 1
+        return response
+
+    def on_error(call: Any, error: BaseException) -> Any:
+        errors.append(str(error))
+        return {"message": "replaced"}
+
+    async with session.serve(SetBool, "/checked", handler, on_error=on_error) as server:
+        response = await session.call(SetBool, "/checked", timeout=LIMIT)
+        assert response.message == "replaced"
+        assert (server.statistics().failed, server.statistics().responded) == (1, 1)
+    assert errors == ["success: expected bool, got int 1"]
