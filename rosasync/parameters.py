@@ -218,6 +218,19 @@ class ParameterClient(NodeClient):
         values = await self._ask_all("GetParameters", "values", names, timeout)
         return _one_or_all(names, self._values(values))
 
+    async def get_all(self, *, timeout: Timeout = ...) -> dict[str, Any]:
+        """Return the values of all parameters that have one, by their names.
+
+        Args:
+            timeout: seconds for each call, None for no deadline; if left out, the client's.
+
+        Raises:
+            ParameterError: a parameter is of an unknown type.
+        """
+        names = await self.list(timeout=timeout)
+        found = self._values(await self._ask("GetParameters", "values", names, timeout))
+        return {name: value for name, value in found.items() if value is not None}
+
     @overload
     async def describe(self, names: str, /, *, timeout: Timeout = ...) -> ParameterDescriptor: ...
 
@@ -385,9 +398,7 @@ class ParameterClient(NodeClient):
         Raises:
             ParameterError: a parameter is of an unknown type.
         """
-        names = await self.list(timeout=timeout)
-        found = self._values(await self._ask("GetParameters", "values", names, timeout))
-        values = {name: value for name, value in found.items() if value is not None}
+        values = await self.get_all(timeout=timeout)
         left_out = {name: NO_EMPTY for name, value in values.items() if value == []}
         for name, value in values.items():
             if isinstance(value, bytes):

@@ -201,3 +201,37 @@ def test_a_closed_pipe_ends_it_quietly() -> None:
     assert done.returncode == 141
     assert len(json_lines(done.stdout)) == 1
     assert own(done.stderr) == ""
+
+
+BOMB = "\n".join(
+    ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
+    + [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 9)]
+)
+
+
+@pytest.mark.parametrize(
+    ("stdin", "message"),
+    [
+        (b"\xff\xfe\x00\x01", "standard input is not text in UTF-8"),
+        (b"{data: 2024-99-99}", "expected bool"),
+        (b"{data: !!int x}", "expected bool"),
+        (BOMB.encode(), "the aliases of this YAML stand for too much"),
+        (b"[" * 100_000, "YAML"),
+        (b"{data: " + b"x" * 20_000_000 + b"}", "expected bool"),
+        (b"x" * (64 * 1024**2 + 2**17), "larger than 64 MiB"),
+    ],
+    ids=["binary", "date", "tag", "bomb", "deep", "long", "large"],
+)
+def test_standard_input_that_is_no_request(stdin: bytes, message: str) -> None:
+    done = subprocess.run(
+        (sys.executable, "-m", "rosasync", "call", LAMP, LAMP_TYPE, "-"),
+        capture_output=True,
+        input=stdin,
+        cwd=ROOT,
+        check=False,
+    )
+    stderr = own(done.stderr.decode())
+    assert (done.returncode, done.stdout) == (2, b"")
+    assert message in stderr
+    assert stderr.count("\n") == 1
+    assert len(stderr) < 1000

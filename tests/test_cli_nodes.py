@@ -14,7 +14,8 @@ from typing import Any
 import pytest
 import yaml
 
-from rosasync._cli.param import read_value
+from rosasync._cli.param_values import read_value
+from rosasync._core.safe_yaml import YamlError
 from rosasync.parameters import ParameterType
 from tests.support.command import rosasync
 from tests.support.managed import NodesProcess
@@ -67,9 +68,54 @@ class TestParam:
         assert yaml.safe_load(await printed(*several)) == values
         assert json.loads(await printed(*several, "--json")) == values
 
+    async def test_set_what_looks_like_an_option(self, nodes: NodesProcess) -> None:
+        node = await nodes.add("undeclared")
+        assert await printed("param", "set", node, "rate", "-3") == "rate: -3\n"
+        assert await printed("param", "set", node, "rate", "-.5", "--json") == '{"rate": -0.5}\n'
+        assert await printed("param", "set", "--", node, "name", "--help") == "name: --help\n"
+        done = await run("param", "set", node, "rate", "1", "--tiemout", "3")
+        assert done.returncode == 2
+        assert "--tiemout" in done.stderr
+
+    async def test_set_by_the_type(self, nodes: NodesProcess) -> None:
+        node = await nodes.add("parameters", "arm")
+        unset = await nodes.add("unset")
+        for name, text, value in (
+            ("any", "1.5", "1.5"),
+            ("any", "010", "8"),
+            ("integer", "010", "8"),
+            ("double_array", "[1, 2]", "[1.0, 2.0]"),
+        ):
+            assert await printed("param", "set", node, name, text) == f"{name}: {value}\n"
+        assert await printed("param", "set", unset, "texts", "[]") == "texts: []\n"
+        done = await run("param", "set", node, "any", "[1, on]")
+        assert (done.returncode, done.stdout) == (2, "")
+        assert "'on' is read as a bool" in done.stderr
+
+    async def test_one_silent_node_of_several(self, nodes: NodesProcess) -> None:
+        silent, other = await nodes.add("slow"), await nodes.add("unset")
+        configured = asyncio.create_task(run("lifecycle", "set", silent, "configure"))
+        await nodes.held()
+        try:
+            listed, states = await asyncio.gather(
+                run("param", "list", "--timeout", str(40 * TICK)),
+                run("lifecycle", "nodes", "--timeout", str(40 * TICK)),
+            )
+        finally:
+            await nodes.release()
+            await configured
+        assert (listed.returncode, states.returncode) == (4, 4)
+        assert f"{other}:\n  first\n" in listed.stdout
+        assert silent not in listed.stdout
+        assert f"{silent}/list_parameters" in listed.stderr
+        assert f"{silent}: unknown [0]\n" in states.stdout
+        assert f"{silent}/get_state" in states.stderr
+
     async def test_delete(self, nodes: NodesProcess) -> None:
         node = await nodes.add("parameters", "arm")
         assert await printed("param", "delete", node, "any") == ""
+        text = await printed("param", "delete", await nodes.add("parameters"), "any", "--json")
+        assert json.loads(text)["deleted"] == "any"
         done = await run("param", "get", node, "any")
         assert done.returncode == 1
         assert done.stderr == f"rosasync: {node}: 'any': it is not declared, or has no value\n"
@@ -88,6 +134,9 @@ class TestParam:
         text = await printed("param", "dump", node)
         file.write_text(text.replace("volume: 5", "volume: 6"))
         assert "volume: 6\n" in await printed("param", "load", node, str(file))
+        fields = json.loads(await printed("param", "dump", node, "--json"))
+        assert fields["node"] == node
+        assert fields["parameters"]["byte_array"] == [0, 255]
         file.write_text("/**: {ros__parameters: {volume: 7}}")
         assert await printed("param", "load", node, str(file), "--use-wildcard") == "volume: 7\n"
 
@@ -111,29 +160,67 @@ class TestParam:
     ("text", "kind", "value"),
     [
         ("1", ParameterType.DOUBLE, 1.0),
+        ("010", ParameterType.DOUBLE, 8.0),
         ("1e-3", ParameterType.DOUBLE, 0.001),
         (".inf", ParameterType.DOUBLE, float("inf")),
+        ("-3", ParameterType.INTEGER, -3),
+        ("010", ParameterType.INTEGER, 8),
+        ("1_000", ParameterType.INTEGER, "1_000"),
         ("true", ParameterType.BOOL, True),
+        ("y", ParameterType.BOOL, True),
         ("true", ParameterType.STRING, "true"),
         ("'true'", ParameterType.STRING, "true"),
         ("[1, 2]", ParameterType.STRING, "[1, 2]"),
         ("a: b", ParameterType.STRING, "a: b"),
-        ("[", ParameterType.NOT_SET, "["),
+        ("[", ParameterType.STRING, "["),
+        ("#fff", ParameterType.STRING, "#fff"),
+        ("*x", ParameterType.STRING, "*x"),
         ("", ParameterType.NOT_SET, ""),
         ("7", ParameterType.NOT_SET, 7),
-        ("[1, 2.5]", ParameterType.NOT_SET, [1, 2.5]),
+        ("010", ParameterType.NOT_SET, 8),
+        ("5e-06", ParameterType.NOT_SET, 5e-06),
+        ("1:30", ParameterType.NOT_SET, "1:30"),
+        ("on", ParameterType.NOT_SET, True),
+        ("[]", ParameterType.NOT_SET, []),
+        ("[1, 2]", ParameterType.NOT_SET, [1, 2]),
+        ("- 1.0\n- 2.5", ParameterType.NOT_SET, [1.0, 2.5]),
+        ("[]", ParameterType.STRING_ARRAY, []),
+        ("[1, on, 'x']", ParameterType.STRING_ARRAY, ["1", "on", "x"]),
         ("[1, 1e-3]", ParameterType.DOUBLE_ARRAY, [1.0, 0.001]),
+        ("[]", ParameterType.DOUBLE_ARRAY, []),
         ("[1, 255]", ParameterType.BYTE_ARRAY, b"\x01\xff"),
         ("[1, 256]", ParameterType.BYTE_ARRAY, [1, 256]),
         ("x", ParameterType.BYTE_ARRAY, "x"),
         ("5", ParameterType.BYTE_ARRAY, 5),
         ("x", ParameterType.DOUBLE, "x"),
+        (str(2**63), ParameterType.INTEGER, 2**63),
+        (str(2**63), ParameterType.NOT_SET, 2.0**63),
+        ("x", ParameterType.DOUBLE_ARRAY, "x"),
     ],
 )
 def test_a_value_is_read_as_its_type_needs_it(text: str, kind: ParameterType, value: Any) -> None:
     result = read_value(text, kind)
     assert result == value
     assert type(result) is type(value)
+
+
+@pytest.mark.parametrize(
+    ("text", "kind", "message"),
+    [
+        ("[1, on]", ParameterType.DOUBLE_ARRAY, "'on' is not a number"),
+        ("[1, on]", ParameterType.NOT_SET, "'on' is read as a bool"),
+        ("[1, 2.5]", ParameterType.NOT_SET, "'2.5' is read as a double"),
+        ("[1, 2.5]", ParameterType.INTEGER_ARRAY, "'2.5' is read as a double"),
+        ("[", ParameterType.NOT_SET, "this is not YAML"),
+        ("a: b", ParameterType.NOT_SET, "no mappings"),
+        ("*x", ParameterType.NOT_SET, "refers to no anchor"),
+        ("#fff", ParameterType.NOT_SET, "there is no value"),
+        ("[" * 200, ParameterType.DOUBLE_ARRAY, "nested too deeply"),
+    ],
+)
+def test_what_is_not_a_value(text: str, kind: ParameterType, message: str) -> None:
+    with pytest.raises(YamlError, match=message):
+        read_value(text, kind)
 
 
 async def examples_of(group: str, command: str) -> list[str]:

@@ -7,24 +7,25 @@ decides that without the field: it would send "True" for ``on`` and 8 for ``010`
 
 from __future__ import annotations
 
+import base64
+import binascii
 import json
 import math
 import re
+import reprlib
 import time
 from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any
 
-import yaml
-
 from rosasync._cli.emitter import UNREADABLE
+from rosasync._core.safe_yaml import STRING_TAG, Event, YamlError, at, build
 from rosasync._ros.fields import FieldType, field_types
 from rosasync._ros.messages import to_dict, to_message
 from rosasync._ros.types import Unquoted, type_name
 
 __all__ = ["DocumentError", "documents", "dump_json", "plain", "read_message"]
 
-_Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _TIME = "builtin_interfaces/msg/Time"
 _HEADER = "std_msgs/msg/Header"
 _TRUE = {"true", "yes", "on"}
@@ -41,6 +42,11 @@ _FLOATS = {
 }
 
 
+_BINARY_TAG = "tag:yaml.org,2002:binary"
+_FIELD_TAGS = {f"tag:yaml.org,2002:{name}" for name in ("bool", "float", "int", "null")}
+"""The tags that say no more than the type of the field does."""
+
+
 class DocumentError(ValueError):
     """A document that is not a message; the message says where and why."""
 
@@ -51,17 +57,18 @@ class _Plain(Unquoted):
     __slots__ = ()
 
 
-class _TextLoader(_Loader):  # type: ignore[misc]
-    """Reads every plain scalar as its text."""
-
-    yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012
-
-
-def _construct_text(_: Any, node: Any) -> str:
-    return str(node.value) if node.style else _Plain(node.value)
-
-
-_TextLoader.add_constructor("tag:yaml.org,2002:str", _construct_text)
+def _read_scalar(event: Event) -> Any:
+    """Return the text of a scalar; a plain one, or one with the tag of a number, as `_Plain`."""
+    if event.tag in (None, "!", STRING_TAG):
+        return event.value if event.style or event.tag else _Plain(event.value)
+    if event.tag in _FIELD_TAGS:
+        return _Plain(event.value)
+    if event.tag == _BINARY_TAG:
+        try:
+            return base64.b64decode("".join(event.value.split()).encode(), validate=True)
+        except binascii.Error as error:
+            raise YamlError(f"{at(event)}: {event.value!r} is not base64: {error}") from None
+    raise YamlError(f"{at(event)}: the tag {event.tag} is not supported here")
 
 
 def read_message(message_type: type[Any], text: str) -> Any:
@@ -71,16 +78,14 @@ def read_message(message_type: type[Any], text: str) -> Any:
         DocumentError: the document is malformed, or does not fit the type.
     """
     try:
-        value = yaml.load(text, _TextLoader)
-    except yaml.YAMLError as error:
-        raise DocumentError(f"this is not YAML: {' '.join(str(error).split())}") from None
-    except RecursionError:
-        raise DocumentError("this YAML is nested too deeply") from None
+        value = build(text, _read_scalar)
+    except YamlError as error:
+        raise DocumentError(str(error)) from None
     if value is None or (isinstance(value, _Plain) and value in ("", "~", "null")):
         value = {}
     if not isinstance(value, dict):
         raise DocumentError(
-            f"expected the fields of {type_name(message_type)} as 'name: value', got {value!r}"
+            f"expected the fields of {type_name(message_type)} as 'name: value', got {reprlib.repr(value)}"
         )
     try:
         return to_message(message_type, _fit_fields(value, message_type))

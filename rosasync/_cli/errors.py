@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from enum import IntEnum
 
 import rosasync
 
-__all__ = ["CliError", "Code", "code_of", "join", "line_of"]
+__all__ = ["CliError", "Code", "code_of", "code_of_all", "join", "line_of"]
 
 
 class Code(IntEnum):
@@ -58,6 +59,13 @@ def code_of(error: BaseException) -> Code:
     if isinstance(error, CliError):
         return error.code
     return next((code for kind, code in _CODES if isinstance(error, kind)), Code.FAILED)
+
+
+def code_of_all(codes: Collection[Code]) -> Code:
+    """Return the exit code for several failures: theirs, if they are all of one kind."""
+    if not codes:
+        return Code.ANSWERED
+    return next(iter(codes)) if len({*codes}) == 1 else Code.FAILED
 
 
 def line_of(error: BaseException) -> str:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import asyncio
 import enum
 from typing import Annotated
 
 import typer
 
-import rosasync
 from rosasync._cli.errors import CliError, Code
-from rosasync._cli.node_names import NodeName, nodes_that_serve
+from rosasync._cli.node_names import NodeName, ask_each, nodes_that_serve
 from rosasync._cli.options import AsJson, Timeout, Wait
 from rosasync._cli.output import print_json
 from rosasync._cli.run import open_session, run
@@ -38,6 +36,8 @@ class Transition(enum.StrEnum):
 @app.command()
 def nodes(timeout: Timeout = 10.0, wait: Wait = None, as_json: AsJson = False) -> None:
     """List the lifecycle nodes in the graph, and their states.
+
+    The state of one that does not answer is unknown, and an error says why.
 
     \b
     Examples:
@@ -90,20 +90,13 @@ def set_state(
     run(_set(node, transition, timeout, as_json))
 
 
-async def _nodes(timeout: float, wait: float | None, as_json: bool) -> None:
+async def _nodes(timeout: float, wait: float | None, as_json: bool) -> int:
     async with open_session(timeout) as session:
         names = await nodes_that_serve(session, "get_state", "lifecycle_msgs/srv/GetState", wait)
-        states = await asyncio.gather(*(_state_of(session, name) for name in names))
-        for name, state in zip(names, states, strict=True):
-            _print_state(name, state, as_json, alone=False)
-
-
-async def _state_of(session: rosasync.Session, name: str) -> LifecycleState:
-    """Return a node's state; unknown if it does not answer, so that the others are listed."""
-    try:
-        return await LifecycleClient(session, name).state()
-    except TimeoutError:
-        return LifecycleState.UNKNOWN
+        answers = await ask_each(names, lambda name: LifecycleClient(session, name).state())
+    for name in names:
+        _print_state(name, answers.found.get(name, LifecycleState.UNKNOWN), as_json, alone=False)
+    return answers.code
 
 
 async def _get(node: str, timeout: float, as_json: bool) -> None:

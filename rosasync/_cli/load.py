@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import rosasync
-from rosasync._cli.errors import Code, code_of
+from rosasync._cli.errors import Code, code_of, code_of_all
 from rosasync._cli.histogram import percentile
 
 __all__ = ["Tally", "make_calls", "milliseconds"]
@@ -52,9 +52,7 @@ class Tally:
     @property
     def code(self) -> Code:
         """The exit code: that of the failures if they are all of one kind."""
-        if not self.codes:
-            return Code.ANSWERED
-        return next(iter(self.codes)) if len(self.codes) == 1 else Code.FAILED
+        return code_of_all(self.codes)
 
     def start(self) -> None:
         """Start the clock."""

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-import yaml
 
-from rosasync._cli.errors import CliError
-from rosasync._cli.node_names import NodeName, nodes_that_serve
+from rosasync._cli.errors import CliError, Code
+from rosasync._cli.node_names import NodeName, ask_each, nodes_that_serve
 from rosasync._cli.options import AsJson, Timeout, Wait
-from rosasync._cli.output import print_value
+from rosasync._cli.output import print_json, print_value
+from rosasync._cli.param_values import read_value
 from rosasync._cli.run import open_session, run
 from rosasync.parameters import ParameterClient, ParameterError, ParameterType
 
@@ -66,26 +65,33 @@ def get(
     run(_get(node, names, timeout, as_json))
 
 
-@app.command("set")
+# A value may look like an option: -3.
+@app.command("set", context_settings={"ignore_unknown_options": True})
 def set_value(
     node: NodeName,
     name: ParameterName,
-    value: Annotated[str, typer.Argument(metavar="VALUE", help="The value as YAML.")],
+    value: Annotated[
+        str, typer.Argument(metavar="VALUE", help="The value, as in a parameter file.")
+    ],
     timeout: Timeout = 10.0,
     as_json: AsJson = False,
 ) -> None:
-    """Set a parameter. The value is read as the parameter's type needs it.
+    """Set a parameter. The value is read as in a parameter file.
+
+    The parameter's type decides, if it has one that cannot change: 1 is 1.0 for a double.
 
     \b
     Examples:
       $ rosasync param set /arm speed 0.5
-      $ rosasync param set /arm home '[0, 0, 0.5]'
+      $ rosasync param set /arm home '[0.0, 0.0, 0.5]'
     """
     run(_set(node, name, value, timeout, as_json))
 
 
 @app.command()
-def delete(node: NodeName, name: ParameterName, timeout: Timeout = 10.0) -> None:
+def delete(
+    node: NodeName, name: ParameterName, timeout: Timeout = 10.0, as_json: AsJson = False
+) -> None:
     """Undeclare a parameter, if the node allows that.
 
     \b
@@ -93,7 +99,7 @@ def delete(node: NodeName, name: ParameterName, timeout: Timeout = 10.0) -> None
       $ rosasync param delete /arm payload
       $ rosasync param delete /arm payload --timeout 2
     """
-    run(_delete(node, name, timeout))
+    run(_delete(node, name, timeout, as_json))
 
 
 @app.command()
@@ -111,15 +117,15 @@ def describe(
 
 
 @app.command()
-def dump(node: NodeName, timeout: Timeout = 10.0) -> None:
-    """Print a node's parameters as a YAML file.
+def dump(node: NodeName, timeout: Timeout = 10.0, as_json: AsJson = False) -> None:
+    """Print a node's parameters as a YAML file. With --json, all of them as one object.
 
     \b
     Examples:
       $ rosasync param dump /arm
       $ rosasync param dump /arm > arm.yaml
     """
-    run(_dump(node, timeout))
+    run(_dump(node, timeout, as_json))
 
 
 @app.command()
@@ -142,17 +148,18 @@ def load(
     run(_load(node, file, use_wildcard, timeout, as_json))
 
 
-async def _list(node: str | None, timeout: float, wait: float | None, as_json: bool) -> None:
+async def _list(node: str | None, timeout: float, wait: float | None, as_json: bool) -> int:
     async with open_session(timeout) as session:
         if node is not None:
             _print_names(node, await ParameterClient(session, node).list(), as_json, alone=True)
-            return
+            return Code.ANSWERED
         nodes = await nodes_that_serve(
             session, "list_parameters", "rcl_interfaces/srv/ListParameters", wait
         )
-        found = await asyncio.gather(*(ParameterClient(session, name).list() for name in nodes))
-        for name, names in zip(nodes, found, strict=True):
-            _print_names(name, names, as_json, alone=False)
+        answers = await ask_each(nodes, lambda name: ParameterClient(session, name).list())
+    for name, names in answers.found.items():
+        _print_names(name, names, as_json, alone=False)
+    return answers.code
 
 
 def _print_names(node: str, names: list[str], as_json: bool, *, alone: bool) -> None:
@@ -175,18 +182,28 @@ async def _get(node: str, names: list[str], timeout: float, as_json: bool) -> No
 async def _set(node: str, name: str, text: str, timeout: float, as_json: bool) -> None:
     async with open_session(timeout) as session:
         client = ParameterClient(session, node)
-        kind = ParameterType.NOT_SET
-        with suppress(ParameterError):
-            kind = await client.types(name)
-        value = read_value(text, kind)
+        kind = await _static_type(client, name)
         with _usage_errors():
+            value = read_value(text, kind)
             await client.set(name, value)
     print_value(_plain({name: value}), as_json=as_json)
 
 
-async def _delete(node: str, name: str, timeout: float) -> None:
+async def _static_type(client: ParameterClient, name: str) -> ParameterType:
+    """Return the type of a parameter, NOT_SET if it is not declared or its type may change."""
+    try:
+        kind = await client.types(name)
+        descriptor = await client.describe(name)
+    except ParameterError:
+        return ParameterType.NOT_SET
+    return ParameterType.NOT_SET if descriptor.dynamic_typing else kind
+
+
+async def _delete(node: str, name: str, timeout: float, as_json: bool) -> None:
     async with open_session(timeout) as session:
         await ParameterClient(session, node).set(name, None)
+    if as_json:
+        print_json({"node": node, "deleted": name})
 
 
 async def _describe(node: str, names: list[str], timeout: float, as_json: bool) -> None:
@@ -197,9 +214,14 @@ async def _describe(node: str, names: list[str], timeout: float, as_json: bool) 
         print_value(fields, as_json=as_json, separate=position > 0)
 
 
-async def _dump(node: str, timeout: float) -> None:
+async def _dump(node: str, timeout: float, as_json: bool) -> None:
     async with open_session(timeout) as session:
-        print(await ParameterClient(session, node).dump(), end="")
+        client = ParameterClient(session, node)
+        if not as_json:
+            print(await client.dump(), end="")
+            return
+        values = await client.get_all()
+    print_json({"node": node, "parameters": _plain(values)})
 
 
 async def _load(node: str, file: Path, use_wildcard: bool, timeout: float, as_json: bool) -> None:
@@ -207,27 +229,6 @@ async def _load(node: str, file: Path, use_wildcard: bool, timeout: float, as_js
         with _usage_errors():
             values = await ParameterClient(session, node).load(file, use_wildcard=use_wildcard)
     print_value(_plain(values), as_json=as_json)
-
-
-def read_value(text: str, kind: ParameterType) -> Any:
-    """Read a value from YAML, as a parameter of this type needs it."""
-    if kind is ParameterType.DOUBLE:
-        with suppress(ValueError):
-            return float(text)
-    try:
-        value = yaml.safe_load(text)
-    except yaml.YAMLError:
-        value = text
-    if kind is ParameterType.STRING or not isinstance(value, bool | int | float | list):
-        return value if isinstance(value, str) else text
-    if not isinstance(value, list):
-        return value
-    with suppress(TypeError, ValueError):
-        if kind is ParameterType.DOUBLE_ARRAY:
-            return [float(item) for item in value]
-        if kind is ParameterType.BYTE_ARRAY:
-            return bytes(value)
-    return value
 
 
 @contextmanager

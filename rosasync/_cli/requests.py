@@ -7,12 +7,12 @@ import os
 import re
 import sys
 from collections.abc import AsyncIterator, Iterator
-from pathlib import Path
 from typing import Any
 
 from rosasync._cli.documents import DocumentError, documents, plain, read_message
 from rosasync._cli.emitter import dump_yaml
 from rosasync._cli.errors import CliError, join
+from rosasync._core.safe_yaml import MAX_BYTES, read_bytes
 from rosasync._ros.interfaces import Field, fields
 from rosasync._ros.types import type_name
 
@@ -21,6 +21,7 @@ __all__ = ["message_from", "requests_from", "rounds_of", "split_type", "template
 STDIN = "-"
 CHUNK = 65536
 _TIMED = re.compile(r"\b(now|auto)\b")
+TOO_LARGE = f"a document of standard input is larger than {MAX_BYTES // 1024**2} MiB"
 
 
 def split_type(srv_type: str | None, text: str | None) -> tuple[str | None, str | None]:
@@ -104,13 +105,21 @@ def _element_lines(field: Field, indent: str) -> Iterator[str]:
 def _text_of(text: str) -> str:
     """Return the text itself, or that of the file it names."""
     if text == STDIN:
-        return sys.stdin.read()
+        return _decode(sys.stdin.buffer.read(MAX_BYTES + 1))
     if not text.startswith("@"):
         return text
     try:
-        return Path(text[1:]).read_text()
+        return read_bytes(text[1:]).decode()
     except (OSError, UnicodeDecodeError) as error:
         raise CliError(f"cannot read {text[1:]}: {error}") from None
+
+
+def _decode(data: bytes) -> str:
+    """Return the text that was read from standard input."""
+    try:
+        return data.decode()
+    except UnicodeDecodeError as error:
+        raise CliError(f"standard input is not text in UTF-8: {error}") from None
 
 
 def _read(message_type: type[Any], document: str) -> Any:
@@ -124,24 +133,33 @@ def _read(message_type: type[Any], document: str) -> Any:
 async def _stdin_documents() -> AsyncIterator[str]:
     """Yield each document as soon as the next one begins, or the input ends."""
     lines: list[str] = []
+    size = 0
     async for line in _stdin_lines():
         if re.match(r"---(?=\s|$)", line):
             for document in documents("".join(lines)):
                 yield document
-            lines = []
+            lines, size = [], 0
         lines.append(line)
+        size += len(line)
+        if size > MAX_BYTES:
+            raise CliError(TOO_LARGE)
     for document in documents("".join(lines)):
         yield document
 
 
 async def _stdin_lines() -> AsyncIterator[str]:
     """Read standard input without a thread, which could not be ended while it blocks."""
-    rest = b""
+    # The parts of the line that has not ended.
+    parts: list[bytes] = []
     while chunk := await _stdin_chunk():
-        *lines, rest = (rest + chunk).split(b"\n")
-        for line in lines:
-            yield line.decode(errors="replace") + "\n"
-    yield rest.decode(errors="replace")
+        end, *others = chunk.split(b"\n")
+        parts.append(end)
+        for start in others:
+            yield _decode(b"".join(parts)) + "\n"
+            parts = [start]
+        if len(parts) > MAX_BYTES // CHUNK:
+            raise CliError(TOO_LARGE)
+    yield _decode(b"".join(parts))
 
 
 async def _stdin_chunk() -> bytes:

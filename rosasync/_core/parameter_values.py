@@ -198,8 +198,8 @@ def is_empty(event: Event) -> bool:
     return not event.value and event.style not in ("'", '"')
 
 
-def read_value(text: str) -> Value | None:
-    """Read a value as rcl reads the one of ``-p name:=value``; None for an empty list.
+def read_value(text: str) -> Value:
+    """Read a value as rcl reads the one of ``-p name:=value``. An empty list is one, too.
 
     Raises:
         YamlError: rcl does not accept it; the message says why.
@@ -207,6 +207,7 @@ def read_value(text: str) -> Value | None:
     """
     yaml = import_yaml()
     values, variant = Values(), Variant()
+    empty: list[Any] | None = None
     for event in events(text):
         if isinstance(event, yaml.ScalarEvent):
             if is_empty(event):
@@ -214,8 +215,12 @@ def read_value(text: str) -> Value | None:
             values.put(event, variant)
         elif isinstance(event, yaml.SequenceStartEvent):
             values.start_list()
+            empty = []
         elif isinstance(event, yaml.SequenceEndEvent):
             values.end_list()
         elif isinstance(event, yaml.AliasEvent | yaml.MappingStartEvent):
             raise YamlError(f"{at(event)}: a parameter has no mappings and no aliases")
-    return variant.value
+    value = empty if variant.value is None else variant.value
+    if value is None:
+        raise YamlError("there is no value")
+    return value

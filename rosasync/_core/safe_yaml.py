@@ -119,13 +119,14 @@ def load(text: str | bytes) -> Any:
         YamlError: as for `events`; or a value does not fit its tag.
     """
     yaml = import_yaml()
-    for _ in events(text):
-        pass  # Within the limits.
+    documents = sum(isinstance(event, yaml.DocumentStartEvent) for event in events(text))
+    if documents > 1:
+        raise YamlError(f"expected a single document, got {documents}")
     try:
         return yaml.load(text, _fastest(yaml))
     except yaml.YAMLError as error:
         raise YamlError(f"this is not YAML: {_line_of(error)}") from None
-    except (ArithmeticError, LookupError, TypeError, ValueError) as error:
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         # PyYAML's constructors raise whatever int, date and the like raise: 2024-99-99, !!bool x.
         raise YamlError(f"a value does not fit its tag or its form: {error}") from None
 

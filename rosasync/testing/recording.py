@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
+from rosasync._core.safe_yaml import YamlError, load, read_bytes
 from rosasync._ros.messages import to_dict, to_message
 from rosasync._ros.types import service_type, type_name
 from rosasync.testing.hooks import GraphSession, Hooks
@@ -123,7 +124,8 @@ class Recording:
         import yaml
 
         content = {"rosasync-recording": FORMAT, "calls": [asdict(call) for call in self.calls]}
-        Path(path).write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
+        text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+        Path(path).write_text(text, encoding="utf-8")
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -132,12 +134,14 @@ class Recording:
         Raises:
             ImportError: PyYAML is not installed.
             OSError: the file cannot be read.
-            ValueError: it is not a recording, or a field does not fit the type of its service.
+            ValueError: it is not a recording, is larger than 64 MiB, or a field does not fit the
+                type of its service.
             TypeError: a field's value is of the wrong kind.
         """
-        import yaml
-
-        content = yaml.safe_load(Path(path).read_text())
+        try:
+            content = load(read_bytes(path))
+        except YamlError as error:
+            raise ValueError(f"{path}: {error}") from None
         if not isinstance(content, dict) or content.get("rosasync-recording") != FORMAT:
             raise ValueError(f"{path} is not a recording of format {FORMAT}")
         calls = content.get("calls") or []
