@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 import yaml
 
+from rosasync import ServiceCall, Session
 from rosasync._cli.param_values import read_value
 from rosasync._core.safe_yaml import YamlError
 from rosasync.parameters import ParameterType
@@ -39,6 +40,11 @@ async def printed(*arguments: str) -> str:
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     return done.stdout
+
+
+async def hang(_: ServiceCall) -> None:
+    """Handle a request that is never answered."""
+    await asyncio.Event().wait()
 
 
 @pytest.mark.slow
@@ -93,23 +99,21 @@ class TestParam:
         assert "'on' is read as a bool" in done.stderr
 
     async def test_one_silent_node_of_several(self, nodes: NodesProcess) -> None:
-        silent, other = await nodes.add("slow"), await nodes.add("unset")
-        configured = asyncio.create_task(run("lifecycle", "set", silent, "configure"))
-        await nodes.held()
-        try:
-            listed, states = await asyncio.gather(
-                run("param", "list", "--timeout", str(40 * TICK)),
-                run("lifecycle", "nodes", "--timeout", str(40 * TICK)),
-            )
-        finally:
-            await nodes.release()
-            await configured
-        assert (listed.returncode, states.returncode) == (4, 4)
+        other = await nodes.add("unset")
+        timeout = ("--timeout", str(40 * TICK))
+        async with (
+            Session("its_host") as session,
+            session.serve("rcl_interfaces/srv/ListParameters", "/silent/list_parameters", hang),
+            session.serve("lifecycle_msgs/srv/GetState", "/silent/get_state", hang),
+        ):
+            listed = await run("param", "list", *timeout)
+            states = await run("lifecycle", "nodes", *timeout)
         assert f"{other}:\n  first\n" in listed.stdout
-        assert silent not in listed.stdout
-        assert f"{silent}/list_parameters" in listed.stderr
-        assert f"{silent}: unknown [0]\n" in states.stdout
-        assert f"{silent}/get_state" in states.stderr
+        assert "/silent:" not in listed.stdout
+        assert "/silent/list_parameters" in listed.stderr
+        assert "/silent: unknown [0]\n" in states.stdout
+        assert "/silent/get_state" in states.stderr
+        assert (listed.returncode, states.returncode) == (4, 4)
 
     async def test_delete(self, nodes: NodesProcess) -> None:
         node = await nodes.add("parameters", "arm")

@@ -252,6 +252,7 @@ parameter_names = st.one_of(
 @relaxed
 @given(parameters=st.dictionaries(parameter_names, values, max_size=8))
 @example({"a": "123E5", "b": ["1e5", "x"], "c": 5e-324, "d": math.nan, "e": -0.0, "f": 1e16})
+@example({".".join("a" * 300): 1, ".".join("a" * 19): 2})
 @example({"a": 1, "a.b": 2, "a.b.c": 3, "a..b": 4, ".a": 5, "a.": 6})
 def test_what_is_written_is_what_a_node_has(
     stock: StartedProcess, parameters: dict[str, Any]

@@ -224,6 +224,8 @@ class _Reader:
 # Writing
 
 _PLAIN = re.compile(r"[A-Za-z_/][A-Za-z0-9_./-]*(?: [A-Za-z0-9_./-]+)*")
+DEPTH = 20
+"""Names with more parts than this are written in one line."""
 _YAML_WORDS = frozenset(["null", "true", "false", "yes", "no", "on", "off", "y", "n"])
 
 
@@ -258,9 +260,11 @@ def _nested(values: Iterable[tuple[str, Value]]) -> dict[str, Any]:
     """Return nested dicts for sorted names with dots."""
     root: dict[str, Any] = {}
     for name, value in values:
-        if all(name.split(".")):
+        parts = name.split(".")
+        # No key may be empty, and readers bound the depth.
+        if all(parts) and len(parts) <= DEPTH:
             _insert(root, name, value)
-        else:  # A part of the name is empty, which no key may be.
+        else:
             root[name] = value
     return root
 
