@@ -85,7 +85,8 @@ def read_message(message_type: type[Any], text: str) -> Any:
         value = {}
     if not isinstance(value, dict):
         raise DocumentError(
-            f"expected the fields of {type_name(message_type)} as 'name: value', got {reprlib.repr(value)}"
+            f"expected the fields of {type_name(message_type)} as 'name: value', got "
+            f"{reprlib.repr(value)}"
         )
     try:
         return to_message(message_type, _fit_fields(value, message_type))
