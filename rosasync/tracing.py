@@ -181,6 +181,13 @@ class Tracing:
         finally:
             self._muted = False
 
+    def for_servers(self) -> Tracing:
+        """Return what a server that is created now traces its requests by.
+
+        In a muted block, that is a part of an action server, whose goals are followed.
+        """
+        return _PartTracing(self._hooks) if self._muted else self
+
     def follow(self, name: str, type_name: str) -> CallTrace | None:
         """Start the trace of an action's goal, if something listens."""
         now = monotonic_ns()
@@ -198,6 +205,22 @@ class Tracing:
         if not self._hooks:
             self.quiet_until = now + RECHECK_NS
         return self._hooks
+
+
+class _PartTracing(Tracing):
+    """Follows the calls of an action's services, only for hooks with a true ``action_calls``."""
+
+    def __init__(self, hooks: tuple[Trace, ...]) -> None:
+        super().__init__()
+        self._hooks = hooks
+        self._muted = True
+
+    def listeners(self, now: int) -> tuple[Trace, ...]:
+        """Return what listens to a call that starts now."""
+        listeners = super().listeners(now)
+        if not listeners:
+            self.quiet_until = now + RECHECK_NS
+        return listeners
 
 
 class CallTrace:

@@ -12,10 +12,11 @@ import pytest
 from action_msgs.msg import GoalStatusArray
 from test_msgs.action import Fibonacci
 
-from rosasync import GoalStatus, Session
+from rosasync import ContextShutdown, GoalAborted, GoalStatus, ServerGone, Session
 from rosasync._core.ports import TopicQos
 from rosasync.testing import FakeGraph, VirtualClock
-from tests.support.times import until
+from tests.support.times import LIMIT, until
+from tests.support.traced import Recorder
 
 SEND, GET = Fibonacci.Impl.SendGoalService, Fibonacci.Impl.GetResultService
 
@@ -134,3 +135,66 @@ async def test_the_status_of_many_goals_is_published_less_often(fake_graph: Fake
         await server.aclose()
         last = status.published[-1].status_list
         assert [each.status for each in last] == [GoalStatus.SUCCEEDED] * 119
+
+
+class TestTracing:
+    """The trace of a session follows goals, and their calls only if it asks for them."""
+
+    async def test_goals(self, fake_graph: FakeGraph) -> None:
+        trace = Recorder()
+
+        async def handler(goal: Any) -> Any:
+            match goal.request.order:
+                case 1:
+                    raise GoalAborted("blocked")
+                case 2:
+                    await asyncio.sleep(LIMIT)
+            return {"sequence": []}
+
+        async with fake_graph.session(trace=trace) as session, fake_graph.session() as client:
+            session.serve_action(Fibonacci, "/fib", handler)
+            await client.act(Fibonacci, "/fib")
+            with pytest.raises(GoalAborted):
+                await client.act(Fibonacci, "/fib", {"order": 1})
+            first = asyncio.create_task(client.act(Fibonacci, "/fib", {"order": 2}))
+            await until(lambda: len(trace.of("server")) == 3)
+            second = asyncio.create_task(client.act(Fibonacci, "/fib"))
+            await until(lambda: len(trace.of("server")) == 4)
+            first.cancel()
+            await second
+        assert trace.of("server") == [
+            "handling > answered",
+            "handling > failed > failed",
+            "handling > canceling > cancelled",
+            "queued > handling > answered",
+        ]
+        assert {(call.srv_name, call.srv_type) for call in trace.calls} == {
+            ("/fib", "test_msgs/action/Fibonacci")
+        }
+
+    async def test_their_calls_too(self, fake_graph: FakeGraph) -> None:
+        trace = Recorder()
+        trace.action_calls = True  # type: ignore[attr-defined]
+        async with fake_graph.session(trace=trace) as session, fake_graph.session() as client:
+            session.serve_action(Fibonacci, "/fib", at_once)
+            await client.act(Fibonacci, "/fib")
+        assert {call.srv_name for call in trace.calls} == {
+            "/fib",
+            "/fib/_action/send_goal",
+            "/fib/_action/get_result",
+        }
+
+    async def test_a_server_that_ends_at_once(self, fake_graph: FakeGraph) -> None:
+        trace = Recorder()
+
+        async def handler(goal: Any) -> Any:
+            await asyncio.sleep(LIMIT)
+
+        async with fake_graph.session(trace=trace) as session, fake_graph.session() as client:
+            server = session.serve_action(Fibonacci, "/fib", handler)
+            task = asyncio.create_task(client.act(Fibonacci, "/fib"))
+            await until(lambda: trace.calls)
+            server.end(ContextShutdown)
+            with pytest.raises(ServerGone):
+                await task
+        assert trace.of("server") == ["handling > dropped"]

@@ -9,6 +9,7 @@ import logging
 from collections.abc import Awaitable, Callable, Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass
+from time import monotonic_ns
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from rosasync._actions.goal_table import GoalEvent, GoalRecord
@@ -20,6 +21,7 @@ from rosasync.typing import FeedbackT, GoalT, ResultT
 if TYPE_CHECKING:
     from rosasync._actions.server_goals import ServerGoals
     from rosasync._server.handler_tasks import HandlerTasks
+    from rosasync.tracing import Outcome, ServerTrace, ServerTracing
 
 __all__ = ["GoalErrorHook", "GoalHandler", "GoalRunner", "OnBusy", "check_handler", "check_on_busy"]
 
@@ -84,13 +86,21 @@ class _Execution:
         record: its state.
         task: the task of its handler, once that has begun.
         closes: whether the handler closes the server, which then does not cancel it.
+        trace: follows the goal, if something listens.
     """
 
     goal: ServerGoal[Any, Any]
     record: GoalRecord
     task: asyncio.Task[Any] | None = None
     closes: bool = False
+    trace: ServerTrace | None = None
 
+
+_OUTCOMES: dict[GoalEvent, Outcome] = {
+    GoalEvent.SUCCEED: "answered",
+    GoalEvent.CANCELED: "cancelled",
+    GoalEvent.ABORT: "failed",
+}
 
 _current: ContextVar[_Execution | None] = ContextVar("current_goal", default=None)
 """The goal whose handler runs here. Tasks that a handler starts inherit it."""
@@ -111,6 +121,7 @@ class GoalRunner:
         make_result: makes a result of what a handler returned; raises TypeError and ValueError.
         goals: the states of the goals.
         tasks: the tasks of the handlers.
+        traces: the traces of the goals.
 
     Attributes:
         counts: how many goals have ended, by event.
@@ -128,6 +139,7 @@ class GoalRunner:
         make_result: Callable[[Any], Any],
         goals: ServerGoals,
         tasks: HandlerTasks,
+        traces: ServerTracing,
     ) -> None:
         self._loop = asyncio.get_running_loop()
         self._name = name
@@ -140,6 +152,7 @@ class GoalRunner:
         self._make_result = make_result
         self._goals = goals
         self._tasks = tasks
+        self._traces = traces
         # Both by the goals' ids, in the order of acceptance.
         self._running: dict[bytes, _Execution] = {}
         self._waiting: dict[bytes, _Execution] = {}
@@ -170,14 +183,22 @@ class GoalRunner:
         """Run an accepted goal, now or when it is its turn."""
         if self._on_busy == "replace":
             self._replace()
-        self._waiting[record.id] = _Execution(goal, record)
+        execution = _Execution(goal, record, trace=self._traces.start(monotonic_ns()))
+        self._waiting[record.id] = execution
         self._start_waiting()
+        if execution.trace is not None and record.id in self._waiting:
+            execution.trace.enter("queued")
 
     def cancel(self, goal_id: bytes) -> None:
         """Cancel a goal whose status is CANCELING: end it if it waits, or its handler."""
-        if (waiting := self._waiting.pop(goal_id, None)) is not None:
-            self._end(waiting, GoalEvent.CANCELED, None)
-        elif (execution := self._running.get(goal_id)) is not None:
+        execution = self._waiting.get(goal_id) or self._running.get(goal_id)
+        if execution is None:
+            return
+        if execution.trace is not None:
+            execution.trace.enter("canceling")
+        if self._waiting.pop(goal_id, None) is not None:
+            self._end(execution, GoalEvent.CANCELED, None)
+        else:
             # Not at once: a task that has not begun would end without running its handler.
             self._loop.call_soon(self._cancel_task, execution)
 
@@ -223,7 +244,19 @@ class GoalRunner:
             del self._waiting[goal_id]
             self._running[goal_id] = execution
             self._goals.apply(execution.record, GoalEvent.EXECUTE)
-            self._tasks.spawn(self._run(execution))
+            trace = execution.trace
+            if trace is not None:
+                trace.enter("handling")
+            self._tasks.spawn(
+                self._run(execution),
+                functools.partial(self._abandon, execution),
+                None if trace is None else trace.context,
+            )
+
+    def _abandon(self, execution: _Execution) -> None:
+        """End a goal whose task something has cancelled before it began."""
+        del self._running[execution.record.id]
+        self._end(execution, GoalEvent.ABORT, None)
 
     async def _run(self, execution: _Execution) -> None:
         execution.task = asyncio.current_task()
@@ -249,6 +282,8 @@ class GoalRunner:
             logger.error("%s: the handler of %r was cancelled by other code", self._name, goal)
             return GoalEvent.ABORT, None
         except Exception as error:
+            if execution.trace is not None:
+                execution.trace.fail(error)
             if goal.cancelling and isinstance(error, GoalCanceled):
                 return GoalEvent.CANCELED, self._result_of(error)
             return GoalEvent.ABORT, await self._fail(goal, error)
@@ -259,10 +294,15 @@ class GoalRunner:
         if self._goals.closed and isinstance(error, SessionClosed | ContextShutdown):
             logger.warning("%s: the handler of %r outlasted the server", self._name, goal)
             return None
-        if isinstance(error, GoalAborted) and (result := self._result_of(error)) is not None:
+        # One that has a name was raised by a goal that the handler itself has sent.
+        if isinstance(error, GoalAborted) and not error.srv_name:
             logger.warning("%s: the handler aborted %r: %s", self._name, goal, error)
-            return result
-        logger.error("%s: the handler of %r raised an exception", self._name, goal, exc_info=error)
+            if (result := self._result_of(error)) is not None:
+                return result
+        else:
+            logger.error(
+                "%s: the handler of %r raised an exception", self._name, goal, exc_info=error
+            )
         if self._on_error is None:
             return None
         try:
@@ -285,5 +325,8 @@ class GoalRunner:
 
     def _end(self, execution: _Execution, event: GoalEvent, result: Any) -> None:
         result = self._make_result({}) if result is None else result
-        if self._goals.end(execution.record, event, result):
-            self.counts[event] += 1
+        if not self._goals.end(execution.record, event, result):
+            return
+        self.counts[event] += 1
+        if execution.trace is not None:
+            execution.trace.end(_OUTCOMES[event])

@@ -28,12 +28,14 @@ from rosasync._server.handler_tasks import HandlerTasks
 from rosasync._server.handlers import check_hook
 from rosasync.errors import ContextShutdown, SessionClosed, UsageError
 from rosasync.options import check_count, check_seconds, check_timeout
-from rosasync.statistics import ActionServerStatistics
+from rosasync.statistics import ActionServerStatistics, ServiceKey
+from rosasync.tracing import ServerTracing
 from rosasync.typing import FeedbackT, GoalT, ResultT
 
 if TYPE_CHECKING:
     from rosasync._core.ports import Action, NodePort, PublisherPort
     from rosasync._server.server import ServiceServer
+    from rosasync.tracing import Tracing
 
 __all__ = ["ActionServer", "ServeService"]
 
@@ -70,6 +72,7 @@ class ActionServer(Generic[GoalT, ResultT, FeedbackT]):
         result_timeout: float | None = 900.0,
         on_error: GoalErrorHook[GoalT, FeedbackT, ResultT] | None = None,
         on_end: Callable[[ActionServer[GoalT, ResultT, FeedbackT]], object],
+        tracing: Tracing,
         on_accepted: Callable[[ServerGoal[GoalT, FeedbackT]], object] | None = None,
     ) -> None:
         self._loop = asyncio.get_running_loop()
@@ -79,6 +82,7 @@ class ActionServer(Generic[GoalT, ResultT, FeedbackT]):
         # For the stubs of `rosasync.testing`.
         self._on_accepted = on_accepted
         self._tasks = HandlerTasks()
+        self._traces = ServerTracing(tracing, ServiceKey(action.name, action.type_name))
         self._goals = ServerGoals(
             action.name,
             GoalTable(
@@ -99,6 +103,7 @@ class ActionServer(Generic[GoalT, ResultT, FeedbackT]):
             make_result=self._make_result,
             goals=self._goals,
             tasks=self._tasks,
+            traces=self._traces,
         )
         self._goal_intake = GoalIntake(
             action.name,
@@ -315,6 +320,7 @@ class ActionServer(Generic[GoalT, ResultT, FeedbackT]):
         self._ending = ending
         self._closing = True
         self._goals.close()
+        self._traces.close()
         for service in self._services:
             service.end(ending)
         for publisher in self._publishers:

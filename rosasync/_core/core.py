@@ -117,7 +117,7 @@ class Core:
             srv_name,
             handler,
             on_end=self.servers.pop,
-            tracing=self.tracing,
+            tracing=self.tracing.for_servers(),
             reporter=self.reporter,
             **options,
         )
@@ -131,14 +131,16 @@ class Core:
         if self.closed:
             raise session_closed()
         self.pool.check_open()
-        server = ActionServer[Any, Any, Any](
-            self.node,
-            serve,
-            self.node.describe_action(action_type, action_name),
-            handler,
-            on_end=self.action_servers.pop,
-            **options,
-        )
+        with self.tracing.muted():
+            server = ActionServer[Any, Any, Any](
+                self.node,
+                serve,
+                self.node.describe_action(action_type, action_name),
+                handler,
+                on_end=self.action_servers.pop,
+                tracing=self.tracing,
+                **options,
+            )
         self.action_servers[server] = None
         return server
 

@@ -11,8 +11,8 @@ from tests.support.times import until
 __all__ = ["Recorder"]
 
 PHASES = {
-    "client": ["waiting", "queued", "sent", "sent again"],
-    "server": ["queued", "handling", "failed", "deferred"],
+    "client": ["waiting", "queued", "sent", "sent again", "accepted", "canceling"],
+    "server": ["queued", "handling", "canceling", "failed", "deferred"],
 }
 
 
