@@ -13,7 +13,7 @@ from typing import Any
 
 import yaml
 
-__all__ = ["UNREADABLE", "dump_yaml", "quote"]
+__all__ = ["UNREADABLE", "dump_yaml"]
 
 UNREADABLE = re.compile(r"[\x7f-\x9f\u2028\u2029\ufeff\ufffe\uffff]")
 """Characters that JSON allows in a text and YAML does not, or takes for the end of a line."""
@@ -32,7 +32,7 @@ def dump_yaml(value: object) -> str:
     return "\n".join(_lines(value, ""))
 
 
-def quote(text: str) -> str:
+def _quote(text: str) -> str:
     """Return a text as JSON, which YAML reads as well."""
     quoted = json.dumps(text, ensure_ascii=False)
     return UNREADABLE.sub(lambda match: f"\\u{ord(match[0]):04x}", quoted)
@@ -99,7 +99,7 @@ def _text(text: str, *, flow: bool) -> str:
     if _PLAIN.fullmatch(text) and text.lower() not in _WORDS:
         return text
     if _CONTROL.search(text) or UNREADABLE.search(text):
-        return quote(text)
+        return _quote(text)
     return _by_pyyaml(text, flow=flow)
 
 

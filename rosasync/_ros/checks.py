@@ -5,10 +5,10 @@ generated C code that serialises them trusts every value. It sends ``numpy.True_
 field as False, the bits of an int as those of a float, 300 in a uint8 as 44, and reads beyond the
 end of a fixed array that is too short. So every message is checked before it is sent.
 
-The function for a type is a single expression, which reads the slots of the message directly:
-that is about three times as fast as a loop over descriptions of the fields. It may say no to a
-message that rclpy would send correctly, but never yes to another: `rosasync._ros.fields.fit`
-decides then, field by field.
+The function for a type is a single expression, which reads the slots of the message directly: that
+is six times as fast as the loop of `rosasync._ros.fields.fit` for a message of one field, and more
+for others. It may say no to a message that rclpy would send correctly, but never yes to another:
+`fit` decides then, field by field.
 """
 
 from __future__ import annotations
