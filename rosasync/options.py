@@ -22,6 +22,7 @@ __all__ = [
     "SessionOptions",
     "check_count",
     "check_flag",
+    "check_limits",
     "check_retry",
     "check_seconds",
     "check_timeout",
@@ -89,6 +90,12 @@ def check_flag(name: str, value: object) -> None:
     """Raise `TypeError` unless ``value`` is a bool."""
     if not isinstance(value, bool):
         raise TypeError(f"{name} must be True or False, not {type(value).__name__}")
+
+
+def check_limits(limits: Limits) -> None:
+    """Raise ``TypeError`` unless this is a `Limits`."""
+    if not isinstance(limits, Limits):
+        raise TypeError(f"limits must be a rosasync.Limits, not {type(limits).__name__}")
 
 
 def check_retry(value: object) -> None:
@@ -228,8 +235,7 @@ class SessionOptions:
             raise ValueError(
                 f"introspection must be 'off', 'metadata' or 'contents', not {self.introspection!r}"
             )
-        if not isinstance(self.limits, Limits):
-            raise TypeError(f"limits must be a rosasync.Limits, not {type(self.limits).__name__}")
+        check_limits(self.limits)
         if self.timeout is not None:
             check_seconds("timeout", self.timeout)
         _set(self, "timeout", check_timeout(self.timeout, None))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import importlib
 from collections.abc import Callable, Mapping
-from types import TracebackType
+from types import EllipsisType, TracebackType
 from typing import TYPE_CHECKING, Any, Generic, Literal, NoReturn, Self, overload
 
 from rosasync._core.aio import call_in_thread
@@ -361,6 +361,9 @@ class Session:
         *,
         timeout: Timeout = ...,
         qos: QoSProfile | None = None,
+        limits: Limits | None = None,
+        wait: bool | float = True,
+        retry: Retry | None = None,
     ) -> ServiceClient[RequestT, ResponseT]: ...
 
     @overload
@@ -371,6 +374,9 @@ class Session:
         *,
         timeout: Timeout = ...,
         qos: QoSProfile | None = None,
+        limits: Limits | None = None,
+        wait: bool | float = True,
+        retry: Retry | None = None,
     ) -> ServiceClient[Any, Any]: ...
 
     def client(
@@ -380,17 +386,34 @@ class Session:
         *,
         timeout: Timeout = ...,
         qos: QoSProfile | None = None,
+        limits: Limits | None = None,
+        wait: bool | float = True,
+        retry: Retry | None = None,
     ) -> ServiceClient[Any, Any]:
         """Bind a type and a name, for several calls. The handle owns nothing: the pool does.
 
+        Args:
+            srv_type: a service class or its name.
+            srv_name: the service's name.
+            timeout: seconds for each call; None for no deadline; if left out, the session's.
+            qos: as for `call`.
+            limits: what the pool may use for these calls; None for the session's. Clients with the
+                same limits share a pool, apart from calls with the session's.
+            wait: for calls that give none; see `call`.
+            retry: for calls that give none; ``Retry(attempts=1)`` in a call switches it off.
+
         Raises:
             InvalidServiceName: ROS does not allow the name.
-            TypeError, ValueError: type, QoS or timeout do not fit.
+            TypeError, ValueError: an argument does not fit.
             SessionClosed, ContextShutdown: the session has ended.
         """
         core = self._use()
         service = core.pool.service(srv_type, srv_name, qos)
-        return ServiceClient(core, service, check_timeout(timeout, core.timeout))
+        # All arguments are checked before anything is made.
+        seconds = core.arguments.defaults(timeout, core.timeout, wait, retry)
+        if limits is not None:
+            service = core.pool.limited(service.service, limits)
+        return ServiceClient(core, service, seconds, wait, retry)
 
     async def wait_for_service(
         self,
@@ -888,12 +911,21 @@ class Session:
 class ServiceClient(Generic[RequestT, ResponseT]):
     """A service type and name bound to a session; see `Session.client`."""
 
-    __slots__ = ("_core", "_service", "_timeout")
+    __slots__ = ("_core", "_retry", "_service", "_timeout", "_wait")
 
-    def __init__(self, core: Core, service: ServicePool, timeout: float | None) -> None:
+    def __init__(
+        self,
+        core: Core,
+        service: ServicePool,
+        timeout: float | None,
+        wait: bool | float,
+        retry: Retry | None,
+    ) -> None:
         self._core = core
         self._service = service
         self._timeout = timeout
+        self._wait = wait
+        self._retry = retry
 
     def __repr__(self) -> str:
         return f"<ServiceClient {self.srv_name} [{self.srv_type}]>"
@@ -919,13 +951,17 @@ class ServiceClient(Generic[RequestT, ResponseT]):
         request: RequestT | Mapping[str, Any] | None = None,
         *,
         timeout: Timeout = ...,
-        wait: bool | float = True,
+        wait: bool | float | EllipsisType = ...,
         retry: Retry | None = None,
     ) -> ResponseT:
         """Call the service; see `Session.call`."""
         core = self._core
         core.check_loop()
         service = self._service
+        if wait is ...:
+            wait = self._wait
+        if retry is None:
+            retry = self._retry
         message, seconds = core.arguments.call(
             service.service, request, timeout, self._timeout, wait, retry
         )
@@ -937,13 +973,17 @@ class ServiceClient(Generic[RequestT, ResponseT]):
         request: RequestT | Mapping[str, Any] | None = None,
         *,
         timeout: Timeout = ...,
-        wait: bool | float = True,
+        wait: bool | float | EllipsisType = ...,
         retry: Retry | None = None,
     ) -> asyncio.Task[ResponseT]:
         """Start the same call as a task; see `Session.start`."""
         core = self._core
         core.check_loop()
         service = self._service
+        if wait is ...:
+            wait = self._wait
+        if retry is None:
+            retry = self._retry
         message, seconds = core.arguments.call(
             service.service, request, timeout, self._timeout, wait, retry
         )

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Collection
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Generic, overload
 
 from rosasync._client.graph_watch import GraphWatch
@@ -12,7 +13,7 @@ from rosasync._client.latency import summarize
 from rosasync._client.service import MATCH_TIMEOUT, ServicePool
 from rosasync._core.aio import Deadlines
 from rosasync.errors import UsageError
-from rosasync.options import check_count, check_timeout
+from rosasync.options import check_count, check_limits, check_timeout
 from rosasync.statistics import KeyStatistics, PoolStatistics, ServiceKey
 from rosasync.typing import RequestT, ResponseT
 
@@ -53,7 +54,8 @@ class ClientPool:
         self._timeout = timeout
         self._tracing = tracing
         self._opened = self._loop.time()
-        self._services: dict[ServiceKey, ServicePool] = {}
+        # None for the session's limits.
+        self._services: dict[tuple[ServiceKey, Limits | None], ServicePool] = {}
         # Repeated calls find their service here by the type and name as given, unresolved.
         self._shortcuts: dict[tuple[Any, str], ServicePool] = {}
         self._deadlines = Deadlines()
@@ -150,12 +152,13 @@ class ClientPool:
     def statistics(self) -> PoolStatistics:
         """Take a snapshot of the pool, in total and for each service."""
         # A copy, because `__repr__` may run in any thread, and a loop over the original would fail.
-        services = self._services.copy()
-        keys = {key: service.statistics() for key, service in services.items()}
-        names = [name for name in KeyStatistics.__dataclass_fields__ if name != "latency"]
-        total = {name: sum(getattr(s, name) for s in keys.values()) for name in names}
-        latency = summarize(service.latencies for service in services.values())
-        return PoolStatistics(**total, latency=latency, keys=keys)
+        services = tuple(self._services.copy().values())
+        pools: dict[ServiceKey, list[ServicePool]] = {}
+        for service in services:
+            pools.setdefault(service.service.key, []).append(service)
+        keys = {key: _statistics_of(its_pools) for key, its_pools in pools.items()}
+        latency = summarize(service.latencies for service in services)
+        return PoolStatistics(**_sums(keys.values()), latency=latency, keys=keys)
 
     # For the session.
 
@@ -184,13 +187,33 @@ class ClientPool:
         Raises:
             SessionClosed, ContextShutdown: the session has ended.
         """
+        return self._pool_of(service, None)
+
+    def limited(self, service: Service, limits: Limits) -> ServicePool:
+        """Return the pool of one service with other limits than the session's.
+
+        Raises:
+            TypeError: not `Limits`.
+            SessionClosed, ContextShutdown: the session has ended.
+        """
+        check_limits(limits)
+        # A deeper window needs a deeper history of the client, or the middleware drops responses.
+        deep = replace(service, in_flight=limits.in_flight)
+        return self._pool_of(deep, None if limits == self._limits else limits)
+
+    def _pool_of(self, service: Service, limits: Limits | None) -> ServicePool:
         self.check_open()
-        pool = self._services.get(service.key)
+        pool = self._services.get((service.key, limits))
         if pool is None:
             pool = ServicePool(
-                service, self._node, self._limits, self._watch, self._deadlines, self._tracing
+                service,
+                self._node,
+                limits or self._limits,
+                self._watch,
+                self._deadlines,
+                self._tracing,
             )
-            self._services[service.key] = pool
+            self._services[service.key, limits] = pool
         return pool
 
     def graph_changed(self) -> None:
@@ -213,6 +236,19 @@ class ClientPool:
         for service in self._services.values():
             service.end(ending)
         self._shortcuts.clear()
+
+
+def _statistics_of(pools: list[ServicePool]) -> KeyStatistics:
+    """Return the statistics of one service, whose pools differ in their limits."""
+    if len(pools) == 1:
+        return pools[0].statistics()
+    latency = summarize(pool.latencies for pool in pools)
+    return KeyStatistics(**_sums([pool.statistics() for pool in pools]), latency=latency)
+
+
+def _sums(statistics: Collection[KeyStatistics]) -> dict[str, int]:
+    names = [name for name in KeyStatistics.__dataclass_fields__ if name != "latency"]
+    return {name: sum(getattr(one, name) for one in statistics) for name in names}
 
 
 class LeasedClient(Generic[RequestT, ResponseT]):

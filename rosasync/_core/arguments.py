@@ -64,3 +64,17 @@ class ArgumentChecker:
         if wait is not True:
             check_wait(wait)
         return request, default
+
+    def defaults(
+        self, timeout: Timeout, default: float | None, wait: bool | float, retry: Retry | None
+    ) -> float | None:
+        """Check what a client's calls use if they give nothing; return the timeout.
+
+        Raises:
+            TypeError, ValueError: an argument does not fit.
+        """
+        if retry is not None:
+            check_retry(retry)
+        if wait is not True:
+            check_wait(wait)
+        return check_timeout(timeout, default)

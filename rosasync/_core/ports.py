@@ -61,6 +61,7 @@ class Service:
         qos: the ``QoSProfile``, or None for the default.
         key: the key of the service in the pool.
         fits: whether a value is a request that can be sent as it is.
+        in_flight: the most requests that a client has outstanding, if it is not the session's.
     """
 
     srv_type: Any
@@ -68,6 +69,7 @@ class Service:
     qos: Any
     key: ServiceKey
     fits: Callable[[Any], bool] = field(compare=False, repr=False)
+    in_flight: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -172,7 +172,10 @@ class RosNode:
         try:
             created = self._identities.before(response_readers, service.key.srv_name)
             client = self._opened.open_client(
-                service.srv_type, service.srv_name, _qos_of(service, self._client_depth()), deliver
+                service.srv_type,
+                service.srv_name,
+                _qos_of(service, self._client_depth(service)),
+                deliver,
             )
             client.identity = created()
         except RclpyError as error:
@@ -395,10 +398,10 @@ class RosNode:
             return ExecutorBridge(self._node, self._gateway, self._introspect)
         return DirectBridge(self._node, librcl, self._loop, self._introspect, options.busy_poll)
 
-    def _client_depth(self) -> int:
+    def _client_depth(self, service: Service) -> int:
         if configuration.heartbeats():
             return names.DEPTH
-        return max(names.DEPTH_WITHOUT_HEARTBEATS, self._in_flight)
+        return max(names.DEPTH_WITHOUT_HEARTBEATS, self._in_flight, service.in_flight)
 
     def _introspect(self, entity: Any) -> None:
         """Make a client or service publish its calls, as ``introspection`` says."""

@@ -617,3 +617,48 @@ async def test_a_repr_in_another_thread_while_services_are_added(
         finally:
             ended.set()
             sys.setswitchinterval(interval)
+
+
+class TestClients:
+    """The defaults of `Session.client`."""
+
+    async def test_limits_of_its_own(self, fake_graph: FakeGraph) -> None:
+        fake_graph.serve(Echo, "/echo", echo)
+        deep = Limits(in_flight=30, server_depth=None)
+        async with fake_graph.session() as session:
+            client = session.client(Echo, "/echo", limits=deep)
+            same = session.client(Echo, "/echo", limits=Limits(in_flight=30, server_depth=None))
+            plain = session.client(Echo, "/echo", limits=Limits())
+            with fake_graph.delay_responses(4 * TICK):
+                calls = [one.start() for one in (client, same) for _ in range(25)]
+                await until(lambda: session.pool.statistics().in_flight == 30)
+                total = session.pool.statistics()
+                assert (total.clients, total.waiting) == (1, 20)
+                calls += [plain.start(), session.start(Echo, "/echo")]
+                await until(lambda: session.pool.statistics().clients == 2)
+                assert len(session.pool.statistics().keys) == 1
+            await asyncio.gather(*calls)
+            with pytest.raises(TypeError, match="limits must be"):
+                session.client(Echo, "/echo", limits=10)  # type: ignore[call-overload]
+
+    async def test_wait_and_retry(self, fake_graph: FakeGraph) -> None:
+        async with fake_graph.session() as session:
+            impatient = session.client(Echo, "/echo", wait=False, retry=Retry(after=TICK))
+            with pytest.raises(ServiceUnavailable):
+                await impatient.call()
+            with pytest.raises(ServiceUnavailable):
+                await impatient.start()
+            waiting = impatient.start(wait=True)
+            await asyncio.sleep(0)
+            with fake_graph.drop_requests():
+                fake_graph.serve(Echo, "/echo", echo)
+                await until(lambda: session.pool.statistics().in_flight)
+            await waiting
+            assert session.pool.statistics().retried == 1
+            with fake_graph.drop_requests(), pytest.raises(ResponseTimeout):
+                await impatient.call(retry=Retry(attempts=1), timeout=4 * TICK)
+            assert session.pool.statistics().retried == 1
+            mistakes: list[dict[str, Any]] = [{"wait": "no"}, {"retry": 3}]
+            for mistake in mistakes:
+                with pytest.raises(TypeError):
+                    session.client(Echo, "/echo", **mistake)
