@@ -1,4 +1,4 @@
-"""The commands about many programs and faults: ``sharing``, ``faults``, ``cold``, ``publish``."""
+"""The commands about many programs and faults, such as ``sharing``, and ``publish``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import typer
 from matplotlib.figure import Figure
 from rich.progress import Progress
 
-from benchmarks import cold, crash, faults, sharing
+from benchmarks import cold, crash, faults, overload, sharing
 from benchmarks.hosts import NoHosts
 from benchmarks.pages import replace_section
 from benchmarks.tables import make_console, make_table
@@ -35,6 +35,7 @@ Contestants = Annotated[str, typer.Option(help="These contestants: a,b,c.")]
 def add_commands(app: typer.Typer) -> None:
     """Add the commands to the command line."""
     app.command("sharing")(share)
+    app.command("overload")(overload_server)
     app.command("faults")(fail)
     app.command("cold")(start)
     app.command("publish")(publish)
@@ -60,6 +61,54 @@ def share(
     with collected(trials, sharing.heading, sharing.row, len(chosen), json) as add:
         cells = sharing.measure(chosen, callers, seconds, before, add)
     show_goals(sharing.goals(cells))
+
+
+def overload_server(
+    clients: Annotated[str, typer.Option(help="Clients: stock,rosasync,afor.")] = "stock,rosasync",
+    servers: Annotated[
+        str, typer.Option(help="Servers: stock,rosasync,rosasync-async.")
+    ] = "stock,rosasync",
+    loads: Annotated[
+        str, typer.Option(help="Calls offered, as shares of what the server can do.")
+    ] = "0.5,0.9,1.5,2,4,10",
+    work: Annotated[str, typer.Option(help="The server's work in ms.")] = "10",
+    spread: Annotated[str, typer.Option(help="constant, exponential or both.")] = "constant",
+    timeouts: Annotated[str, typer.Option(help="0.1, 0.5, 2, mixed, none.")] = "0.5",
+    processes: Annotated[str, typer.Option(help="Numbers of client processes.")] = "1",
+    kept: Annotated[
+        str, typer.Option(help="Numbers of callers that call again after each answer or timeout.")
+    ] = "50",
+    polite: Annotated[bool, typer.Option(help="Also a polite caller beside a flood.")] = True,
+    recovery: Annotated[bool, typer.Option(help="Also the end of an overload.")] = True,
+    everything: Annotated[
+        bool, typer.Option("--all", help="All clients, servers, work, timeouts and processes.")
+    ] = False,
+    seconds: Annotated[float, typer.Option(min=0.1, help="Seconds for each row.")] = 4.0,
+    json: Json = None,
+) -> None:
+    """More calls than a server can answer: how many are answered in time, and what is wasted."""
+    if everything:
+        clients, servers = "stock,rosasync,afor", "stock,rosasync,rosasync-async"
+        work, spread, timeouts = "10,1,100", "constant,exponential", "0.5,0.1,2,mixed,none"
+        processes, kept = "1,4", "50,100,200"
+    with checked():
+        chosen = overload.plans(
+            split(clients),
+            split(servers),
+            split(loads, float),
+            split(work, float),
+            split(spread),
+            split(timeouts),
+            split(processes, int),
+            split(kept, int),
+            polite,
+            recovery,
+        )
+    isolate()
+    trials = Trials(overload.COMMAND, {"seconds": seconds})
+    with collected(trials, overload.heading, overload.row, len(chosen), json) as add:
+        cells = overload.measure(chosen, seconds, add)
+    show_goals(overload.goals(cells))
 
 
 def fail(
@@ -119,9 +168,13 @@ def publish(
     files: Annotated[list[Path], typer.Argument(exists=True, help="Trials saved with --json.")],
     out: Annotated[Path, typer.Option(help="The documentation's folder.")] = Path("docs"),
 ) -> None:
-    """Write saved trials and their plots into docs/benchmarks.md, between their marks."""
-    page = out / "benchmarks.md"
+    """Write saved trials and their plots into the documentation, between their marks.
+
+    Those of ``overload`` go into docs/explanation/overload.md, all others into docs/benchmarks.md.
+    """
     for trials in Trials.load(files):
+        explained = trials.command == overload.COMMAND
+        page = out / ("explanation/overload.md" if explained else "benchmarks.md")
         with checked():
             text = section(trials, out)
             page.write_text(replace_section(page.read_text(), trials.command, text))
@@ -135,6 +188,9 @@ def section(trials: Trials, out: Path) -> str:
     if trials.command == crash.COMMAND:
         return crash.section(trials)
     picture = f"benchmarks/{trials.command}.svg"
+    if trials.command == overload.COMMAND:
+        save(overload.draw(trials), out / picture)
+        return overload.section(trials, f"../{picture}")
     if trials.command == sharing.COMMAND:
         save(sharing.draw(trials), out / picture)
         return sharing.section(trials, picture)

@@ -23,9 +23,9 @@ from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from benchmarks.contestants.base import spinning
 from benchmarks.meter import usage
 from benchmarks.pipes import answer_lines
-from benchmarks.servers import SERVERS, async_handler, rosasync_server
+from benchmarks.servers import LIMITED, SERVERS, async_handler, rosasync_server
 from benchmarks.stopped import stopping_server
-from benchmarks.work import Work, load_type, make_handler, make_qos, make_response
+from benchmarks.work import Work, handled, load_type, make_handler, make_qos, make_response
 
 LEAN_DEPTH = 1000
 WAIT_SET_LIMIT = 16
@@ -178,6 +178,10 @@ class Server:
         self._serve(Work.from_json(work))
         return {}
 
+    def do_handled(self) -> dict[str, Any]:
+        """How many requests the handlers that take time have finished, in all turns."""
+        return {"requests": handled["requests"]}
+
     def do_usage(self) -> dict[str, Any]:
         return usage().to_json()
 
@@ -189,7 +193,7 @@ class Server:
         if work.server == "stopped":
             self._stack.enter_context(stopping_server(work))
             return
-        if work.server in SERVERS:
+        if work.server in (SERVERS | LIMITED):
             self._stack.enter_context(rosasync_server(work))
             return
         rclpy.init()

@@ -11,9 +11,17 @@ from typing import Any, Literal
 import uvloop
 
 import rosasync
-from benchmarks.work import Work, load_type, make_handler, make_qos
+from benchmarks.work import (
+    Work,
+    handled,
+    handling_time,
+    load_type,
+    make_handler,
+    make_qos,
+    make_response,
+)
 
-__all__ = ["SERVERS", "async_handler", "rosasync_server"]
+__all__ = ["LIMITED", "SERVERS", "async_handler", "rosasync_server"]
 
 
 def async_handler(work: Work) -> Callable[[Any, Any], Any]:
@@ -22,6 +30,18 @@ def async_handler(work: Work) -> Callable[[Any, Any], Any]:
 
     async def handler(request: Any, response: Any) -> Any:
         return plain(request, response)
+
+    return handler
+
+
+def waiting_handler(work: Work) -> Callable[[Any, Any], Any]:
+    """Return a handler that waits, as for a device, instead of blocking its loop."""
+    prepared = make_response(work)
+
+    async def handler(_request: Any, _response: Any) -> Any:
+        await asyncio.sleep(handling_time(work))
+        handled.update(("requests",))
+        return prepared
 
     return handler
 
@@ -42,7 +62,7 @@ def rosasync_server(work: Work) -> Iterator[None]:
 
 
 def _run(work: Work, started: threading.Event, ending: list[Callable[[], object]]) -> None:
-    kind = SERVERS[work.server]
+    kind = (SERVERS | LIMITED)[work.server]
     loop_factory = uvloop.new_event_loop if kind.endswith("uvloop") else None
     with asyncio.Runner(loop_factory=loop_factory) as runner:
         runner.run(_serve(work, kind, started, ending))
@@ -53,15 +73,23 @@ async def _serve(
 ) -> None:
     bridge: Literal["direct", "executor"] = "executor" if "executor" in kind else "direct"
     handler = make_handler(work) if "plain" in kind else async_handler(work)
+    concurrency = 100
+    if "one at a time" in kind:
+        handler, concurrency = waiting_handler(work), 1
     qos = None if work.depth is None else make_qos(work.depth)
     over = asyncio.Event()
     loop = asyncio.get_running_loop()
     async with rosasync.Session("bench_server", bridge=bridge) as session:
-        for name in work.names:
-            session.serve(load_type(work.srv_type), name, handler, qos=qos)
+        servers = [
+            session.serve(load_type(work.srv_type), name, handler, qos=qos, concurrency=concurrency)
+            for name in work.names
+        ]
         ending.append(lambda: loop.call_soon_threadsafe(over.set))
         started.set()
         await over.wait()
+        for server in servers:
+            # Without the requests that wait, which may be a thousand.
+            await server.aclose(0)
 
 
 SERVERS = {
@@ -71,3 +99,5 @@ SERVERS = {
     "rosasync-executor": "executor, async",
 }
 """The bridge, handler and loop of each server."""
+LIMITED = {"rosasync-one": "direct, async, one at a time"}
+"""A server for the benchmark of overload alone."""

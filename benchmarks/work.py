@@ -5,7 +5,9 @@ from __future__ import annotations
 import array
 import dataclasses
 import importlib
+import random
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -14,6 +16,8 @@ __all__ = [
     "CALL_TIMEOUT",
     "READY_TIMEOUT",
     "Work",
+    "handled",
+    "handling_time",
     "load_type",
     "make_handler",
     "make_qos",
@@ -26,6 +30,10 @@ CALL_TIMEOUT = 2.0
 
 READY_TIMEOUT = 30.0
 """Seconds that a contestant may take to find its servers."""
+
+
+handled: Counter[str] = Counter()
+"""Counts the requests that handlers with `Work.handling` of this process have finished."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +52,7 @@ class Work:
             ``stock-async``, stock with an async handler; ``stopped``, stock, and stopped by its
             first request; or one of `benchmarks.servers`.
         handling: seconds for which a stock server's callback runs.
+        exponential: whether that is a mean, of exponentially distributed times.
         busy: seconds at a time for which the contestant's thread handles no responses.
         timeout: seconds after which a call counts as lost; only some contestants use it.
         srv_name: the prefix of all service names; each turn has its own.
@@ -57,6 +66,7 @@ class Work:
     depth: int | None = None
     server: str = "stock"
     handling: float = 0.0
+    exponential: bool = False
     busy: float = 0.0
     timeout: float = CALL_TIMEOUT
     srv_name: str = "/bench"
@@ -106,10 +116,16 @@ def make_handler(work: Work) -> Callable[[Any, Any], Any]:
         return lambda _request, _response: prepared
 
     def handle(_request: Any, _response: Any) -> Any:
-        time.sleep(work.handling)
+        time.sleep(handling_time(work))
+        handled.update(("requests",))
         return prepared
 
     return handle
+
+
+def handling_time(work: Work) -> float:
+    """Return for how many seconds a server works on the next request."""
+    return random.expovariate(1 / work.handling) if work.exponential else work.handling
 
 
 def make_qos(depth: int | None) -> Any:

@@ -12,7 +12,18 @@ from typing import Any
 
 import pytest
 
-from benchmarks import cold, commands, crash, faults, hosts, pages, profile, sharing
+from benchmarks import (
+    callers,
+    cold,
+    commands,
+    crash,
+    faults,
+    hosts,
+    overload,
+    pages,
+    profile,
+    sharing,
+)
 from benchmarks.contestants import CONTESTANTS, make_contestant
 from benchmarks.contestants.base import LoggedCall
 from benchmarks.meter import Usage
@@ -323,3 +334,98 @@ def test_a_small_run(command: str, tmp_path: Path) -> None:
         assert faults.Fault(**trials.rows[0]).answered
     else:
         assert all(row["seconds"] for row in trials.rows)
+
+
+def overload_cell(
+    kind: str, client: str, server: str, load: float, **options: Any
+) -> overload.Cell:
+    """Return a cell of the command `overload`: 4 s of a server that can do 100/s."""
+    return overload.Cell(
+        *(kind, client, server, 10.0, False, load, "0.5", 1),
+        **{
+            "seconds": 4.0,
+            "capacity": 100.0,
+            "sent": round(400 * load),
+            "answered": 400,
+            "served": 400,
+            "median": 20.0,
+            "p99": 30.0,
+            **options,
+        },
+    )
+
+
+def test_the_plans_of_overload() -> None:
+    arguments: dict[str, Any] = {
+        "clients": ["stock", "rosasync"],
+        "servers": ["stock", "rosasync"],
+        "loads": [0.5, 4.0],
+        "works": [10.0],
+        "spread": ["constant"],
+        "timeouts": ["0.5"],
+        "processes": [1],
+        "kept": [50],
+        "polite": True,
+        "recovery": True,
+    }
+    found = overload.plans(**arguments)
+    kinds = [plan.kind for plan in found]
+    assert [kinds.count(kind) for kind in ("offered", "kept", "recovery", "polite")] == [8, 4, 4, 2]
+    for name, wrong in (("clients", "stok"), ("servers", "lean"), ("timeouts", "3")):
+        with pytest.raises(ValueError, match=f"no .* {wrong}"):
+            overload.plans(**{**arguments, name: [wrong]})
+    with pytest.raises(ValueError, match="positive"):
+        overload.plans(**{**arguments, "loads": [0.0]})
+
+
+def test_the_goals_of_overload() -> None:
+    cells = [
+        overload_cell("offered", "stock", "stock", 4.0, answered=380),
+        overload_cell("offered", "stock", "rosasync", 4.0, answered=390, served=400),
+        overload_cell("offered", "rosasync", "stock", 4.0, answered=300),
+        overload_cell("offered", "rosasync", "rosasync", 0.9, sent=360, answered=360),
+        overload_cell("polite", "stock", "rosasync", 500, sent=20, answered=20, median=30.0),
+        overload_cell("recovery", "stock", "rosasync", 4.0, sent=80, answered=79),
+    ]
+    assert (cells[1].goodput, cells[1].wanted) == (0.975, 0.975)
+    assert cells[1].waste == 0.025
+    assert (cells[3].goodput, cells[3].wanted) == (0.9, 1.0)
+    met = [goal.met for goal in overload.goals(cells)]
+    assert met == [False, False, True, None, True, True, True, True]
+    assert overload.row(cells[2])[7:9] == ["0.75", "0.75"]
+
+
+def test_the_arrivals_of_overload() -> None:
+    times = list(callers.arrivals([(100.0, 10.0), (10.0, 10.0)], seed=1))
+    assert times == sorted(times)
+    assert sum(at < 10.0 for at in times) == pytest.approx(1000, rel=0.1)
+    assert sum(at >= 10.0 for at in times) == pytest.approx(100, rel=0.3)
+
+
+def test_the_section_of_overload(tmp_path: Path) -> None:
+    cells = [overload_cell("offered", "stock", "stock", load) for load in (0.5, 4.0)]
+    trials = Trials("overload", {"seconds": 4.0}, {**MACHINE, "versions": {}}, "2026-11-30")
+    trials.rows = [dataclasses.asdict(cell) for cell in cells]
+    text = commands.section(trials, tmp_path)
+    assert "](../benchmarks/overload.svg)" in text
+    assert (tmp_path / "benchmarks" / "overload.svg").exists()
+    assert "| stock → stock |" in text
+
+
+@pytest.mark.slow
+def test_a_small_run_of_overload() -> None:
+    chosen = overload.plans(
+        clients=["stock", "rosasync", "afor"],
+        servers=["rosasync", "rosasync-async"],
+        loads=[2.0],
+        works=[10.0],
+        spread=["exponential"],
+        timeouts=["mixed"],
+        processes=[2],
+        kept=[],
+        polite=False,
+        recovery=True,
+    )
+    cells = overload.measure(chosen, 1.0)
+    assert [cell.kind for cell in cells].count("offered") == 6
+    assert all(cell.sent for cell in cells)
