@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,7 +40,7 @@ COMMAND = "crash"
 NAME = "/bench/crash"
 STOCK, RUN, OURS = "stock", "stock with rosasync run", "rosasync"
 CONTESTANTS = (STOCK, BEFORE, OURS, RUN)
-PATIENCE = 15.0
+PATIENCE = 60.0
 """Seconds after which an answer counts as missing."""
 SLOW = 1.0
 CLIENT, SERVER = "client", "server"
@@ -48,6 +48,8 @@ CLIENT, SERVER = "client", "server"
 STOCK_CLIENT = f"""\
 import rclpy, time
 from std_srvs.srv import Empty
+print("standby", flush=True)
+input()
 rclpy.init()
 node = rclpy.create_node("mortal")
 client = node.create_client(Empty, "{NAME}")
@@ -58,8 +60,10 @@ print("answered", begin, time.monotonic(), flush=True)
 time.sleep(60)
 """
 OUR_CLIENT = f"""\
-import asyncio, rosasync, time
+import asyncio, rclpy, rosasync, time
 from std_srvs.srv import Empty
+print("standby", flush=True)
+input()
 async def main():
     async with rosasync.Session("mortal", timeout=None) as session:
         begin = time.monotonic()
@@ -71,6 +75,8 @@ asyncio.run(main())
 STOCK_SERVER = f"""\
 import rclpy, time
 from std_srvs.srv import Empty
+print("standby", flush=True)
+input()
 rclpy.init()
 node = rclpy.create_node("mortal")
 node.create_service(Empty, "{NAME}", lambda request, response: response)
@@ -78,8 +84,10 @@ print("ready", time.monotonic(), flush=True)
 rclpy.spin(node)
 """
 OUR_SERVER = f"""\
-import asyncio, rosasync, time
+import asyncio, rclpy, rosasync, time
 from std_srvs.srv import Empty
+print("standby", flush=True)
+input()
 async def main():
     async with rosasync.Session("mortal") as session:
         session.serve(Empty, "{NAME}", lambda request, response: response)
@@ -186,10 +194,9 @@ def _replace_clients(
 ) -> Iterator[float | None]:
     program = OUR_CLIENT if contestant in (OURS, BEFORE) else STOCK_CLIENT
     with StockServer(NAME):
-        # The first one has no predecessor.
-        for restart in range(restarts + 1):
-            with _killed(_command(contestant, program), environment) as lines:
-                answer = _find(lines, "answered")
+        for restart, client in enumerate(_succession(contestant, program, restarts, environment)):
+            answer = client.find("answered")
+            # The first one has no predecessor.
             if restart:
                 yield None if answer is None else answer[1] - answer[0]
 
@@ -198,57 +205,83 @@ def _replace_servers(
     contestant: str, restarts: int, environment: Mapping[str, str]
 ) -> Iterator[float | None]:
     program = OUR_SERVER if contestant in (OURS, BEFORE) else STOCK_SERVER
-    with _killed((sys.executable, "-c", CALLER), {}) as answers:
-        for restart in range(restarts + 1):
-            with _killed(_command(contestant, program), environment) as lines:
-                ready = _find(lines, "ready")
-                answer = None if ready is None else _find(answers, "answered", after=ready[0])
+    caller = _Process((sys.executable, "-c", CALLER), {})
+    try:
+        for restart, server in enumerate(_succession(contestant, program, restarts, environment)):
+            ready = server.find("ready")
+            answer = None if ready is None else caller.find("answered", after=ready[0])
             if restart:
                 yield None if ready is None or answer is None else answer[0] - ready[0]
+    finally:
+        caller.kill()
 
 
-def _command(contestant: str, program: str) -> tuple[str, ...]:
+def _succession(
+    contestant: str, program: str, restarts: int, environment: Mapping[str, str]
+) -> Iterator[_Process]:
+    """Yield processes, of which each begins as soon as its predecessor is killed.
+
+    It has been started before, as Python and its imports take longer than the peers' watchdogs.
+    """
     prefix = (sys.executable, "-m", "rosasync", "run", "--") if contestant == RUN else ()
-    return (*prefix, sys.executable, "-c", program)
+    current = None
+    try:
+        for _ in range(restarts + 1):
+            successor = _Process((*prefix, sys.executable, "-c", program), environment)
+            successor.find("standby")
+            if current is not None:
+                current.kill()
+            current = successor
+            current.begin()
+            yield current
+    finally:
+        if current is not None:
+            current.kill()
 
 
-@contextmanager
-def _killed(
-    command: Sequence[str], environment: Mapping[str, str]
-) -> Iterator[queue.SimpleQueue[str]]:
-    """Run a process in the block and kill it; yield the lines that it prints."""
-    lines: queue.SimpleQueue[str] = queue.SimpleQueue()
-    with subprocess.Popen(
-        command,
-        cwd=ROOT,
-        env={**os.environ, **environment},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        text=True,
-    ) as process:
+class _Process:
+    """A program that prints lines of a word and times, and waits for a line to begin."""
 
-        def read() -> None:
-            assert process.stdout is not None
-            for line in process.stdout:
-                lines.put(line)
+    def __init__(self, command: Sequence[str], environment: Mapping[str, str]) -> None:
+        self._lines: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self._process = subprocess.Popen(
+            command,
+            cwd=ROOT,
+            env={**os.environ, **environment},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+        )
+        self._reader = threading.Thread(target=self._read)
+        self._reader.start()
 
-        reader = threading.Thread(target=read)
-        reader.start()
-        try:
-            yield lines
-        finally:
-            process.kill()
-            reader.join()
+    def begin(self) -> None:
+        """Let it begin."""
+        assert self._process.stdin is not None
+        self._process.stdin.write("\n")
+        self._process.stdin.flush()
 
+    def find(self, word: str, *, after: float = 0.0) -> tuple[float, ...] | None:
+        """Wait for a line with this word; return its times, None after `PATIENCE`."""
+        end = time.monotonic() + PATIENCE
+        with suppress(queue.Empty):
+            while (left := end - time.monotonic()) > 0:
+                first, *times = self._lines.get(timeout=left).split()
+                if first == word and (not times or float(times[-1]) >= after):
+                    return tuple(map(float, times))
+        return None
 
-def _find(
-    lines: queue.SimpleQueue[str], word: str, *, after: float = 0.0
-) -> tuple[float, ...] | None:
-    """Wait for a line with this word; return its times, None after `PATIENCE`."""
-    end = time.monotonic() + PATIENCE
-    with suppress(queue.Empty):
-        while (left := end - time.monotonic()) > 0:
-            first, *times = lines.get(timeout=left).split()
-            if first == word and float(times[-1]) >= after:
-                return tuple(map(float, times))
-    return None
+    def kill(self) -> None:
+        """End it as a crash does."""
+        self._process.kill()
+        self._process.wait()
+        self._reader.join()
+        for pipe in (self._process.stdin, self._process.stdout):
+            assert pipe is not None
+            pipe.close()
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            self._lines.put(line)

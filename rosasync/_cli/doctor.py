@@ -14,6 +14,7 @@ from pathlib import Path
 import rosasync
 from rosasync._cli.checks import Report
 from rosasync._cli.errors import Code
+from rosasync._cli.graph import settle
 from rosasync._cli.options import AsJson
 from rosasync._cli.run import open_session, run
 from rosasync._cli.why import environment
@@ -188,7 +189,7 @@ def _profile_in_use(file: Path | None) -> str:
 
 async def _calls(report: Report) -> None:
     """Discover and call a server in this process, and one in another."""
-    from rosasync._ros.inspect import bridge_reason
+    from rosasync._ros.inspect import bridge_reason, silence
 
     report.add("bridge", True, bridge_reason())
     name = f"/_rosasync_doctor_{os.getpid()}"
@@ -197,6 +198,14 @@ async def _calls(report: Report) -> None:
             await _try(report, session, "call to itself", f"{name}/own", {})
         async with stock_server(f"{name}/other"):
             await _try(report, session, "other process", f"{name}/other", {})
+        await settle(session)
+        if found := silence(session.node):
+            report.add(
+                "other nodes",
+                False,
+                found,
+                "Start both as one user, and in one /dev/shm",
+            )
 
 
 async def _try(

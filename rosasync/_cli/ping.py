@@ -106,9 +106,17 @@ async def _ping(
 
 async def _ask_node(session: rosasync.Session, phases: _Phases, name: str) -> None:
     """Ask the server's node something harmless: to describe no parameters."""
+    from rosasync._ros.inspect import silence
+
     node = await _server_node(session, resolve(session, name))
+    if node is None:
+        async with phases.phase("answered", "by the server's node"):
+            raise CliError(
+                silence(session.node, resolve(session, name)) or f"{name}: the server is gone",
+                Code.FAILED,
+            )
     service = f"{node}/describe_parameters"
-    if node is None or not await wait_for_types(session, service, DISCOVERY):
+    if not await wait_for_types(session, service, DISCOVERY):
         phases.skip("answered", "not asked: the node has no parameter services; use --request")
         return
     async with phases.phase("answered", f"by the node {node}; --request asks the service itself"):

@@ -44,6 +44,8 @@ async def _why(name: str, srv_type: str | None, as_json: bool, wait: float | Non
     async with open_session() as session:
         resolved = resolve(session, name)
         await settle(session, wait)
+        if not _data(report, session, resolved):
+            return Code.FAILED
         if not (_nodes(report, session) and _name(report, session, resolved)):
             return Code.NO_SERVER
         found = _type(report, session, resolved, srv_type)
@@ -118,6 +120,16 @@ def _domain_and_range(report: Report) -> None:
     )
 
 
+def _data(report: Report, session: rosasync.Session, name: str) -> bool:
+    """Check that data arrives from the servers that are visible."""
+    from rosasync._ros.inspect import silence
+
+    found = silence(session.node, name)
+    if found:
+        report.add("data", False, found, "Try: rosasync doctor")
+    return not found
+
+
 def _nodes(report: Report, session: rosasync.Session) -> bool:
     """Check that other nodes are visible."""
     from rosasync._ros.inspect import domain_id, local_domains, middleware, node_names
@@ -142,7 +154,11 @@ def _name(report: Report, session: rosasync.Session, name: str) -> bool:
     """Check that a server has the name."""
     from rosasync._ros.inspect import services
 
-    served = [other for other in services(session.node) if not is_hidden(other)]
+    served = [
+        other
+        for other in services(session.node)
+        if other == name or is_hidden(name) or not is_hidden(other)
+    ]
     if name in served:
         report.add("name", True, f"{name} is served")
         return True

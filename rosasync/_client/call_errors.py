@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -22,6 +23,9 @@ if TYPE_CHECKING:
 
 __all__ = ["AllServersGone", "CallErrors", "NoServer"]
 
+
+SETTLED = 1.0
+"""Seconds after which something should have arrived from every process that is visible."""
 
 SHARED = 20
 """How long a description of the graph is used again, in multiples of the time that it took."""
@@ -71,6 +75,9 @@ class CallErrors:
         message = f"the request was sent, but not answered within {elapsed:.3g} s"
         if plan is not None:
             message += plan.explain_timeout()
+        with contextlib.suppress(ContextShutdown):
+            if elapsed >= SETTLED and (silence := self._node.explain_silence(self._service)):
+                message += f"; {silence}"
         return self._make(ResponseTimeout, message, elapsed)
 
     def server_gone(self, elapsed: float) -> CallError:

@@ -413,6 +413,13 @@ class NodePort(Protocol):
             ContextShutdown: the node is down.
         """
 
+    def explain_silence(self, service: Service) -> str | None:
+        """Describe why no data arrives from a visible server, as a clause, if that is known.
+
+        Raises:
+            ContextShutdown: the node is down.
+        """
+
     def stop(self) -> None:
         """Ask the executor thread to end. From any thread; idempotent; takes no lock."""
 

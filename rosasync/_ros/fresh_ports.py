@@ -26,7 +26,16 @@ from pathlib import Path
 from rosasync._ros.discovery import BASE, DOMAIN_GAIN, PARTICIPANT_GAIN, UNICAST, udp_sockets
 from rosasync._ros.profile import is_old
 
-__all__ = ["FOLDER", "LEASE", "LOCK", "dead_ports", "fresh_offset", "port_prefix"]
+__all__ = [
+    "FOLDER",
+    "LEASE",
+    "LOCK",
+    "dead_ports",
+    "fresh_offset",
+    "live_ports",
+    "own_ports",
+    "port_prefix",
+]
 
 FOLDER = Path("/dev/shm")
 LOCK = "_el"
@@ -81,15 +90,44 @@ def dead_ports(domain: int) -> list[Path]:
 
     Those are the domain's, and those below `BASE`, which are common to all domains.
     """
+    numbers = _there() & {*range(BASE), *_of(domain)}
+    files = [file for number in sorted(numbers) if _is_dead(number) for file in _files(number)]
+    return [file for file in files if file.exists()]
+
+
+def live_ports(domain: int) -> dict[int, tuple[Path, int]]:
+    """Return the ports of the domain that a process reads from, with their file and its user."""
+    found = {}
+    for number in _there() & {*_of(domain)}:
+        file = _files(number)[0]
+        with contextlib.suppress(OSError):
+            if not _is_dead(number):
+                found[number] = (file, file.stat().st_uid)
+    return found
+
+
+def own_ports() -> set[int]:
+    """Return the numbers of the ports that this process reads from."""
+    names = []
+    for descriptor in os.listdir("/proc/self/fd"):
+        with contextlib.suppress(OSError):
+            names.append(os.path.basename(os.readlink(f"/proc/self/fd/{descriptor}")))
+    return _numbers(names, rf"{port_prefix()}(\d+){LOCK}")
+
+
+def _there() -> set[int]:
+    """Return the numbers of all ports that have a file."""
     try:
         names = os.listdir(FOLDER)
     except OSError:
-        return []
+        return set()
+    return _numbers(names, rf"{port_prefix()}(\d+)(?:{LOCK})?")
+
+
+def _of(domain: int) -> range:
+    """Return the numbers of the ports of a domain."""
     first = BASE + DOMAIN_GAIN * domain
-    own = {*range(BASE), *range(first, first + DOMAIN_GAIN)}
-    numbers = own & _numbers(names, rf"{port_prefix()}(\d+)(?:{LOCK})?")
-    files = [file for number in sorted(numbers) if _is_dead(number) for file in _files(number)]
-    return [file for file in files if file.exists()]
+    return range(first, first + DOMAIN_GAIN)
 
 
 def _choose(ports: set[int]) -> int | None:

@@ -31,6 +31,7 @@ from rosasync._ros.endpoints import (
 from rosasync._ros.failures import uses_node
 from rosasync._ros.names import default_qos
 from rosasync._ros.rcl import Rcl
+from rosasync._ros.silence import explain_silence
 
 __all__ = ["GraphQueries", "GraphWaitable", "describe_similar"]
 
@@ -179,6 +180,14 @@ class GraphQueries:
         kinds = sorted({server.srv_type for server in servers})
         served = [f"{k}{_by([s for s in servers if s.srv_type == k])}" for k in kinds]
         return f"this name is served as {' and as '.join(served)}"
+
+    def explain_silence(self, service: Service) -> str | None:
+        """Describe why no data arrives from a visible server, as a clause, if that is known."""
+        srv_name = service.key.srv_name
+        with uses_node(self._node):
+            if any(server.node for server in self._servers_of(srv_name)):
+                return None
+            return explain_silence(self._node, response_writers(self._node, srv_name))
 
     def _explain_unmatched(self, service: Service) -> str:
         srv_name, srv_type, _ = service.key

@@ -17,8 +17,15 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from rosasync._ros import endpoints, rcl
 from rosasync._ros.discovery import ports_of, udp_sockets
-from rosasync._ros.endpoints import clients_of, full_name, incompatibility, servers_of
+from rosasync._ros.endpoints import (
+    clients_of,
+    full_name,
+    incompatibility,
+    response_writers,
+    servers_of,
+)
 from rosasync._ros.names import default_qos
+from rosasync._ros.silence import DISCOVERY_TOPIC, explain_silence
 
 __all__ = [
     "Endpoint",
@@ -38,14 +45,18 @@ __all__ = [
     "served_types",
     "server_endpoints",
     "services",
+    "silence",
     "subscribe",
 ]
 
-DISCOVERY_TOPIC = "ros_discovery_info"
-"""The topic on which each context announces its nodes: one writer for each participant."""
-
 PARTICIPANTS = 120
 """Participants of a host whose ports fit between those of two domains (RTPS 2.3, 9.6.1)."""
+
+UNEXPLAINED = (
+    "the server is visible, but the name of its node has not arrived. If no data arrives from it "
+    "at all, it may belong to another user, or to a container without a common /dev/shm: start "
+    "both as one user, with --ipc=host"
+)
 
 SAFE_DOMAINS = 102
 """The ports of higher domains are also used for other purposes (Linux's ephemeral ports)."""
@@ -83,6 +94,27 @@ def server_endpoints(node: Node, srv_name: str) -> list[Endpoint]:
 def client_endpoints(node: Node, srv_name: str) -> list[Endpoint]:
     """Return the clients of a resolved name, this process's own included."""
     return [_described(client) for client in clients_of(node, srv_name)]
+
+
+def silence(node: Node, srv_name: str | None = None) -> str | None:
+    """Say why no data arrives from the servers of a name, or from any process, if none does.
+
+    A server whose node is not known is such a one, some seconds after its discovery.
+
+    Args:
+        node: this process's node.
+        srv_name: a resolved name; None for all services.
+
+    Returns:
+        None if nothing is missing.
+    """
+    names = [srv_name] if srv_name else [name for name, _ in node.get_service_names_and_types()]
+    for name in names:
+        writers = response_writers(node, name)
+        if writers and not any(server.node for server in servers_of(node, name)):
+            reason = explain_silence(node, writers)
+            return f"{name}: {reason or UNEXPLAINED}"
+    return None
 
 
 def services(node: Node) -> dict[str, list[str]]:

@@ -266,6 +266,10 @@ class RosNode:
         """Describe the servers of the name as a clause, if all of them have another type."""
         return self._graph.explain_mismatch(service)
 
+    def explain_silence(self, service: Service) -> str | None:
+        """Describe why no data arrives from a visible server, as a clause, if that is known."""
+        return self._graph.explain_silence(service)
+
     def stop(self) -> None:
         """Ask the executor thread to end. From any thread; idempotent; takes no lock.
 

@@ -470,6 +470,10 @@ class FakeNode:
             return None
         return f"this name is served as {' and as '.join(sorted(types))}"
 
+    def explain_silence(self, service: Service) -> str | None:
+        """Return None: nothing gets lost in memory."""
+        return None
+
     def stop(self) -> None:
         """Do nothing: there is no thread."""
 
