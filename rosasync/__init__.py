@@ -8,6 +8,7 @@ from rosasync._actions.server import ActionServer
 from rosasync._actions.server_goal import ServerGoal
 from rosasync._actions.status import GoalStatus
 from rosasync._client.pool import ClientPool, LeasedClient
+from rosasync._client.service_watch import ServiceState
 from rosasync._core.futures import wrap_future
 from rosasync._core.portal import Portal
 from rosasync._core.proxy import AsyncServiceProxy, ProxyState
@@ -88,6 +89,7 @@ __all__ = [
     "ServiceClient",
     "ServiceKey",
     "ServiceServer",
+    "ServiceState",
     "ServiceType",
     "ServiceUnavailable",
     "Session",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import importlib
-from collections.abc import Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
 from types import EllipsisType, TracebackType
 from typing import TYPE_CHECKING, Any, Generic, Literal, NoReturn, Self, overload
 
@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from rosasync._actions.server import ActionServer
     from rosasync._client.pool import ClientPool
     from rosasync._client.service import ServicePool
+    from rosasync._client.service_watch import ServiceState
     from rosasync._core.gateway import LoopGateway
     from rosasync._core.portal import Portal
     from rosasync._core.ports import NodePort
@@ -442,6 +443,38 @@ class Session:
         service = core.pool.service(srv_type, srv_name, qos)
         await service.wait_for_server(check_timeout(timeout, core.timeout))
         return True
+
+    async def watch_service(
+        self,
+        srv_type: ServiceType[Any, Any] | str,
+        srv_name: str,
+        *,
+        qos: QoSProfile | None = None,
+    ) -> AsyncIterator[ServiceState]:
+        """Watch the servers of a service: yield their state now, and after each change.
+
+        ::
+
+            async for state in session.watch_service(SetBool, "/arm/enable"):
+                print(state.status, *state.nodes)
+
+        A session that was just opened knows no servers yet, so the first state may be ``"gone"``.
+        If a server is added to others, the state is ``"up"`` again. It runs until it is left, or
+        until the session ends.
+
+        Args:
+            srv_type: a service class or its name.
+            srv_name: the service's name.
+            qos: as for `call`; a server that does not fit it does not count.
+
+        Raises:
+            TypeError, ValueError, InvalidServiceName: an argument does not fit.
+            SessionClosed, ContextShutdown: the session ended.
+        """
+        core = self._use()
+        service = core.arguments.service(srv_type, srv_name, qos)
+        async for state in core.pool.watch(service):
+            yield state
 
     def service_is_ready(
         self,

@@ -18,6 +18,10 @@ GONE_DELAY = 0.05
 """Seconds to wait for the next response that the last server sent just before it vanished."""
 
 
+LEASE = 20
+"""Seconds for which Fast DDS shows a process that has ended without its clean-up."""
+
+
 class MatchingOwner(Protocol):
     """What a matching needs to know of the service's clients, and reports to them."""
 
@@ -95,11 +99,15 @@ class Matching:
         servers = len(self.servers)
         if servers > self._most:
             self._most = servers
+            names = self._node.name_servers(self._service)
             logger.warning(
-                "%s: %d servers answer this name. Each runs every request, and all responses "
-                "but the first are dropped: stop all but one",
+                "%s: %d servers answer this name%s. Each runs every request, and all responses "
+                "but the first are dropped: stop all but one. After a crash, the dead one is shown "
+                "for up to %d s more; then there is nothing to do",
                 self._service.key.srv_name,
                 servers,
+                f", of {' and '.join(names)}" if names else "",
+                LEASE,
             )
 
     def check_outstanding(self) -> None:

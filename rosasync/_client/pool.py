@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Generic, overload
 from rosasync._client.graph_watch import GraphWatch
 from rosasync._client.latency import summarize
 from rosasync._client.service import MATCH_TIMEOUT, ServicePool
+from rosasync._client.service_watch import ServiceState, watch_servers
 from rosasync._core.aio import Deadlines
 from rosasync.errors import UsageError
 from rosasync.options import check_count, check_limits, check_timeout
@@ -60,6 +61,7 @@ class ClientPool:
         self._shortcuts: dict[tuple[Any, str], ServicePool] = {}
         self._deadlines = Deadlines()
         self._watch = GraphWatch(node, self._services.values(), on_shutdown)
+        self._watchers: set[asyncio.Event] = set()
         self._ending: Callable[[], Exception] | None = None
 
     def __repr__(self) -> str:
@@ -216,9 +218,24 @@ class ClientPool:
             self._services[service.key, limits] = pool
         return pool
 
+    async def watch(self, service: Service) -> AsyncIterator[ServiceState]:
+        """Yield the state of a service, now and after each change; see `Session.watch_service`."""
+        changed = asyncio.Event()
+        self._watchers.add(changed)
+        try:
+            async for state in watch_servers(service, self._node, changed, self.check_open):
+                yield state
+        finally:
+            self._watchers.discard(changed)
+
     def graph_changed(self) -> None:
         """Make the services check the ROS graph again, because it has changed."""
         self._watch.changed()
+        self._wake_watchers()
+
+    def _wake_watchers(self) -> None:
+        for changed in self._watchers:
+            changed.set()
 
     def check_open(self) -> None:
         """Raise the error that calls get, once the session has ended."""
@@ -236,6 +253,7 @@ class ClientPool:
         for service in self._services.values():
             service.end(ending)
         self._shortcuts.clear()
+        self._wake_watchers()
 
 
 def _statistics_of(pools: list[ServicePool]) -> KeyStatistics:

@@ -396,6 +396,13 @@ class NodePort(Protocol):
             ContextShutdown: the node is down.
         """
 
+    def name_servers(self, service: Service) -> tuple[str, ...]:
+        """Return the full names of the nodes that serve this name and type, as far as known.
+
+        Raises:
+            ContextShutdown: the node is down.
+        """
+
     def count_publishers(self, topic_name: str) -> int:
         """Return how many publishers a topic has, in all processes. Cheap.
 

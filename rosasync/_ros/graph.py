@@ -153,6 +153,13 @@ class GraphQueries:
                 return frozenset(range(servers))
         return frozenset()
 
+    def name_servers(self, service: Service) -> tuple[str, ...]:
+        """Name the nodes of the servers; see `rosasync._core.ports.NodePort.name_servers`."""
+        srv_name, srv_type, _ = service.key
+        with uses_node(self._node):
+            servers = self._servers_of(srv_name)
+        return tuple(sorted({s.node for s in servers if s.node and s.srv_type == srv_type}))
+
     def explain_missing(self, service: Service) -> str:
         """Describe what the graph shows instead of this service, as a clause."""
         srv_name, srv_type, _ = service.key

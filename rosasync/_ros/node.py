@@ -258,6 +258,10 @@ class RosNode:
         with uses_node(self._node):
             return int(self._node.count_publishers(topic_name))
 
+    def name_servers(self, service: Service) -> tuple[str, ...]:
+        """Return the full names of the nodes that serve this name and type, as far as known."""
+        return self._graph.name_servers(service)
+
     def explain_missing(self, service: Service) -> str:
         """Describe what the graph shows instead of this service, as a clause."""
         return self._graph.explain_missing(service)

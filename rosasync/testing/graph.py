@@ -451,6 +451,11 @@ class FakeNode:
             for server in self.graph.find(service.key.srv_type, service.key.srv_name)
         )
 
+    def name_servers(self, service: Service) -> tuple[str, ...]:
+        """Return a name for each server: in memory, servers need no node."""
+        servers = self.graph.find(service.key.srv_type, service.key.srv_name)
+        return tuple(f"/server_{number}" for number, _ in enumerate(servers, start=1))
+
     def count_publishers(self, topic_name: str) -> int:
         """Return how many publishers a topic has."""
         return sum(publisher.topic_name == topic_name for publisher in self.graph.publishers)

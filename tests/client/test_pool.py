@@ -547,7 +547,7 @@ async def test_several_servers_of_one_name_are_warned_of_once(
             fake_graph.changed()
             assert await ask(session, 3) == 3
     assert [r.getMessage().split(".")[0] for r in caplog.records] == [
-        "/echo: 2 servers answer this name"
+        "/echo: 2 servers answer this name, of /server_1 and /server_2"
     ]
 
 
