@@ -89,9 +89,9 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
         sender: sends the responses.
         counts: counts the handlers that defer or fail.
         tasks: runs the async handlers.
-        on_finished: called when an async handler has finished.
 
     Attributes:
+        on_finished: called when an async handler has finished; set by `HandlerStarter`.
         running: how many handlers run.
         was_long: whether the handler that was started last has blocked the loop for `LONG`.
     """
@@ -103,8 +103,8 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
         sender: ResponseSender[ResponseT],
         counts: CallCounts,
         tasks: HandlerTasks,
-        on_finished: Callable[[], None],
     ) -> None:
+        self.on_finished: Callable[[], None] = lambda: None
         self.running = 0
         self.was_long = False
         self._kind = kind
@@ -112,7 +112,6 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
         self._sender = sender
         self._counts = counts
         self._tasks = tasks
-        self._on_finished = on_finished
         self._blocking = BlockingReport(sender.name, "" if kind is None else kind.name)
 
     def start(self, call: ServiceCall[RequestT, ResponseT]) -> None:
@@ -191,7 +190,7 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
         """Settle a call whose handler's task was cancelled before it began."""
         self.running -= 1
         self._cancelled(call, pending)
-        self._on_finished()
+        self.on_finished()
 
     def _hook_never_ran(
         self,
@@ -233,7 +232,7 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
             self._contain(call, error, self._fail)
         finally:
             self.running -= 1
-            self._on_finished()
+            self.on_finished()
 
     async def _await_hook(
         self,

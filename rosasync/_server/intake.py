@@ -24,6 +24,9 @@ class Intake(Generic[RequestT, ResponseT]):
         backlog: holds the calls, and decides which is next.
         log: counts and logs overloads.
         on_dropped: called with each call that is dropped because too many wait.
+
+    Attributes:
+        last_age: for how many seconds the call that was served last had waited.
     """
 
     def __init__(
@@ -32,6 +35,7 @@ class Intake(Generic[RequestT, ResponseT]):
         log: OverloadLog,
         on_dropped: Callable[[ServiceCall[RequestT, ResponseT]], None],
     ) -> None:
+        self.last_age = 0.0
         self._loop = asyncio.get_running_loop()
         self._backlog = backlog
         self._log = log
@@ -77,6 +81,7 @@ class Intake(Generic[RequestT, ResponseT]):
         backlog = self._backlog
         now = self._loop.time()
         call = backlog.pop(now)
+        self.last_age = backlog.last_age
         self._log.update(backlog.standing, 0, len(backlog), backlog.oldest_age(now))
         return call
 

@@ -27,6 +27,7 @@ from rosasync._server.intake import Intake
 from rosasync._server.overload import OverloadLog
 from rosasync._server.sending import ResponseSender, service_destroyed
 from rosasync._server.service_call import RequestInfo, ServiceCall
+from rosasync._server.starting import HandlerStarter
 from rosasync._server.status import ServerStatus, Status, check_status
 from rosasync._status.wire import Outcome
 from rosasync.errors import SessionClosed, UsageError
@@ -97,7 +98,7 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         check_hook("on_error", on_error)
         self._on_overload = check_hook("on_overload", on_overload)
         self._on_end = on_end
-        self._concurrency = check_count("concurrency", concurrency, 1)
+        most = check_count("concurrency", concurrency, 1)
         self._has_handler = kind is not None
         limits = (
             check_count("backlog", backlog, 0),
@@ -112,19 +113,15 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         self._taking = True
         self._ended = False
         self._end_task: asyncio.Task[None] | None = None
-        # Whether `_start_waiting` is active, so that it is not entered again.
-        self._starting = False
-        # Whether to look for further requests before the next handler, see `_start`.
-        self._paused = False
         service = node.describe(srv_type, srv_name, qos)
         self._name, self._type_name, _ = service.key
         self._tracing = tracing
         self._traces = ServerTracing(tracing, service.key)
         self._port = node.open_service(service, self._on_request)
         self._qos = self._port.qos
-        self._backlog = Backlog[ServiceCall[RequestT, ResponseT]](*limits, by_arrival=by_arrival)
+        waiting = Backlog[ServiceCall[RequestT, ResponseT]](*limits, by_arrival=by_arrival)
         self._overload = OverloadLog(self._name, by_arrival)
-        self._intake = Intake(self._backlog, self._overload, self._drop)
+        self._intake = Intake(waiting, self._overload, self._drop)
         self._sender = ResponseSender[ResponseT](
             self._name,
             self._type_name,
@@ -135,9 +132,8 @@ class ServiceServer(Generic[RequestT, ResponseT]):
             self._tasks.spawn,
             self._on_destroyed,
         )
-        self._runner = HandlerRunner(
-            kind, on_error, self._sender, self._counts, self._tasks, self._start_waiting
-        )
+        self._runner = HandlerRunner(kind, on_error, self._sender, self._counts, self._tasks)
+        self._starter = HandlerStarter(self._runner, self._intake, most if self._has_handler else 0)
         self._status: ServerStatus | None = None
         if status:
             self._status = ServerStatus(
@@ -231,7 +227,7 @@ class ServiceServer(Generic[RequestT, ResponseT]):
             running=self._runner.running,
             waiting=len(self._intake),
             oldest_age=self._intake.oldest_age,
-            last_age=self._backlog.last_age,
+            last_age=self._intake.last_age,
             overloaded=self._overload.active,
             overloads=self._overload.times,
             unanswered=counts.unanswered,
@@ -327,44 +323,9 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         if self._status is not None:
             number = header.request_id.sequence_number
             call.status = self._status.take(call, self._port.client_of(header), number)
-        if not self._intake and self._can_start:
-            # It has not waited.
-            self._backlog.last_age = 0.0
-            self._start(call)
-        else:
+        if not self._starter.start_now(call):
             self._intake.put(call, self._port.client_of(header), _waited(header))
-            if self._has_handler:
-                self._start_waiting()
-
-    @property
-    def _can_start(self) -> bool:
-        free = self._runner.running < self._concurrency
-        return free and self._has_handler and not self._paused
-
-    def _start(self, call: ServiceCall[RequestT, ResponseT]) -> None:
-        self._runner.start(call)
-        if self._runner.was_long:
-            # The requests that have arrived meanwhile are still in the queue of the middleware. If
-            # the next handler were run now, they would be served in their order, however old they
-            # are. So first the loop takes them, and then the backlog decides.
-            self._paused = True
-            self._loop.call_soon(self._go_on)
-
-    def _go_on(self) -> None:
-        self._paused = False
-        self._start_waiting()
-
-    def _start_waiting(self) -> None:
-        # An eager task (Python 3.12) may finish its handler inside `start`, which calls this again.
-        # With a long backlog that would exceed the recursion limit, so the outer call goes on.
-        if self._starting:
-            return
-        self._starting = True
-        try:
-            while self._intake and self._can_start:
-                self._start(self._intake.pop())
-        finally:
-            self._starting = False
+            self._starter.start_waiting()
 
     def _drop(self, call: ServiceCall[RequestT, ResponseT]) -> None:
         """Settle a call for which the backlog has no room."""
@@ -422,7 +383,7 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         if not self._has_handler:
             self._drop_waiting()
         await self._tasks.wait(deadline)
-        while self._paused and (deadline is None or self._loop.time() < deadline):
+        while self._starter.paused and (deadline is None or self._loop.time() < deadline):
             # Plain handlers run in one turn of the loop each.
             await asyncio.sleep(0)
             await self._tasks.wait(deadline)
