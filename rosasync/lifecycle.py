@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from rosasync import CallError, ResponseTimeout, RosasyncError
 from rosasync._core.node_client import NodeClient
+from rosasync._core.text import duration
 
 if TYPE_CHECKING:
     from rosasync import Session
@@ -274,7 +275,7 @@ class LifecycleClient(NodeClient):
             TransitionTimeout,
             label,
             state,
-            f"not answered within {error.elapsed:.3g} s; {found}",
+            f"not answered within {duration(error.elapsed)}; {found}",
         ) from error
 
     def _failed(self, label: str, state: LifecycleState | None) -> TransitionError:

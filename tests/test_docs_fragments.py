@@ -31,6 +31,7 @@ NOT_RUN = {
     "goal = await": "needs an action; test_wrap_future has one",
     "def ": "defines functions for a program that the reader has",
     "class ": "the same",
+    "async def every_second": "runs until it is cancelled",
     "FromBlackboard(": "needs a tree; test_behaviours has one",
     "self._service_proxy": "is what another library does",
     "response = await client.call(request)  # before": "is what rclpy does",

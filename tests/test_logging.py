@@ -112,7 +112,7 @@ class TestThePool:
         await ask(logged, "/echo", "x")
         assert has(debug, "/echo: created client 1")
         assert has(debug, "/echo: a client is matched with a server")
-        await until(lambda: has(debug, "/echo: the graph shows 1 servers"))
+        await until(lambda: has(debug, "/echo: the graph shows 1 server"))
         await server.stop("/echo")
         await until(lambda: has(debug, "/echo: the graph shows 0 servers"))
 

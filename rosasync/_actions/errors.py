@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, TypeVar
 
+from rosasync._core.text import duration
 from rosasync.errors import CallError, GoalError, ServerGone, ServiceUnavailable
 
 if TYPE_CHECKING:
@@ -40,7 +41,7 @@ class GoalErrors:
         # The graph shows the services of actions.
         seen = seen.replace("/_action/send_goal", "").replace("_SendGoal", "")
         elapsed = self._elapsed(goal)
-        what = f"no action server for {self._action.type_name} after {elapsed:.3g} s; {seen}"
+        what = f"no action server for {self._action.type_name} after {duration(elapsed)}; {seen}"
         return self._call(ServiceUnavailable, what, elapsed)
 
     def server_gone(self, goal: ActiveGoal, what: str) -> CallError:

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from rosasync._core.text import duration
 from rosasync.errors import (
     CallError,
     ContextShutdown,
@@ -53,7 +54,7 @@ class CallErrors:
     def unavailable(self, elapsed: float) -> CallError:
         """Return the error for a call that found no server."""
         seen = self._explain_missing()
-        message = f"no server for {self._service.key.srv_type} after {elapsed:.3g} s; {seen}"
+        message = f"no server for {self._service.key.srv_type} after {duration(elapsed)}; {seen}"
         return self._make(ServiceUnavailable, message, elapsed)
 
     def no_time_left(self) -> CallError:
@@ -64,15 +65,15 @@ class CallErrors:
     def queue_timeout(self, elapsed: float, in_flight: int, abandoned: int) -> CallError:
         """Return the error for a call that found a server, but no free client."""
         message = (
-            f"no client became free within {elapsed:.3g} s: {in_flight} requests are in flight, "
-            f"and {abandoned} abandoned requests (cancelled or timed out) still count; the server "
-            "is slower than its callers"
+            f"no client became free within {duration(elapsed)}: {in_flight} requests are in "
+            f"flight, and {abandoned} abandoned requests (cancelled or timed out) still count; the "
+            "server is slower than its callers"
         )
         return self._make(QueueTimeout, message, elapsed)
 
     def response_timeout(self, elapsed: float, plan: Plan | None) -> CallError:
         """Return the error for a request that was sent and not answered."""
-        message = f"the request was sent, but not answered within {elapsed:.3g} s"
+        message = f"the request was sent, but not answered within {duration(elapsed)}"
         if plan is not None:
             message += plan.explain_timeout()
         with contextlib.suppress(ContextShutdown):
@@ -94,8 +95,9 @@ class CallErrors:
     def pool_full(self, waiting: int, limit: int) -> PoolFull:
         """Return the error for a call that finds the queue full."""
         return PoolFull(
-            f"{self._service.key.srv_name}: {waiting} callers already wait for a client, and "
-            f"Limits.waiting={limit} allows no more: the server is slower than its callers"
+            f"{self._service.key.srv_name}: {waiting} callers wait for a client, and "
+            f"Limits.waiting={limit}: the server is slower than its callers, so call less often, "
+            "or raise the limit"
         )
 
     def _explain_missing(self) -> str:

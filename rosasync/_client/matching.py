@@ -75,7 +75,8 @@ class Matching:
         """Count the servers of the name. Call it after every change of the graph."""
         count = self._node.count_servers(self._service)
         if count != self.count:
-            logger.debug("%s: the graph shows %d servers", self._service.key.srv_name, count)
+            name = self._service.key.srv_name
+            logger.debug("%s: the graph shows %d server%s", name, count, "" if count == 1 else "s")
         self.count = count
 
     def learn(self) -> None:
