@@ -15,6 +15,7 @@ import anyio
 import pytest
 from rcl_interfaces.srv import GetParameters
 from std_srvs.srv import SetBool, Trigger
+from test_msgs.action import Fibonacci
 
 import rosasync
 from rosasync.lifecycle import LifecycleClient
@@ -73,12 +74,18 @@ def known(session: rosasync.Session) -> dict[str, Any]:
     return {
         **{module.__name__: module for module in (anyio, asyncio, logging, rosasync)},
         **{named.__name__: named for named in (LifecycleClient, ParameterClient, Path)},
+        "Drive": Fibonacci,
         "Move": SetBool,
         "SetBool": SetBool,
         "Trigger": Trigger,
+        "drive": drive,
         "handler": lambda request: SetBool.Response(success=request.data),
         "session": session,
     }
+
+
+async def drive(goal: Any) -> Any:
+    return {"sequence": []}
 
 
 @pytest.fixture

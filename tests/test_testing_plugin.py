@@ -99,7 +99,7 @@ def test_the_examples_of_the_page(project: Path, kind: str) -> None:
     (configuration,) = re.findall(r"^```ini\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     (project / "pytest.ini").write_text(configuration)
     output = run(project, f"--rosasync-graph={kind}", "-W", "error::pytest.PytestWarning")
-    assert "6 passed" in output, output
+    assert "8 passed" in output, output
 
 
 def test_strictness(project: Path) -> None:
