@@ -13,6 +13,8 @@
         ├── QueueTimeout         (TimeoutError) the deadline passed while waiting for a client
         ├── ResponseTimeout      (TimeoutError) sent, and not answered in time
         ├── ServerGone           (ConnectionError) every server vanished before it answered
+        ├── HandlerFailed        .error_type .error_message: the server's handler raised
+        ├── ServerOverloaded     the server dropped the request, because too many waited
         └── GoalError            .goal_id: a goal of an action that did not succeed
             ├── GoalRejected     the server did not accept it, or does not know it
             ├── GoalAborted      .result: the server gave up
@@ -39,20 +41,18 @@ __all__ = [
     "GoalError",
     "GoalRejected",
     "GoalTimeout",
+    "HandlerFailed",
     "InvalidServiceName",
     "PoolFull",
     "QueueTimeout",
     "ResponseTimeout",
     "RosasyncError",
     "ServerGone",
+    "ServerOverloaded",
     "ServiceUnavailable",
     "SessionClosed",
     "UsageError",
 ]
-
-
-NO_GOAL = UUID(int=0)
-"""The UUID of an error that a handler raises: rosasync knows the goal by then."""
 
 
 NO_GOAL = UUID(int=0)
@@ -125,7 +125,35 @@ class ResponseTimeout(CallError, TimeoutError):
 
 
 class ServerGone(CallError, ConnectionError):
-    """Every server that could answer vanished while the request was outstanding."""
+    """Every server that could answer vanished, or closed, while the request was outstanding."""
+
+
+class HandlerFailed(CallError):
+    """The handler raised, says a server that was created with ``status=True``.
+
+    Attributes:
+        error_type: the type of the exception, ``"ValueError"`` or ``"module.Name"``; empty if the
+            handler dropped the call unanswered.
+        error_message: its message; empty if the server keeps it to itself.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        srv_name: str,
+        srv_type: str,
+        elapsed: float,
+        error_type: str = "",
+        error_message: str = "",
+    ) -> None:
+        super().__init__(message, srv_name=srv_name, srv_type=srv_type, elapsed=elapsed)
+        self.error_type = error_type
+        self.error_message = error_message
+
+
+class ServerOverloaded(CallError):
+    """The server dropped the request unrun, says a server that was created with ``status=True``."""
 
 
 class GoalError(CallError):

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import numbers
 import operator
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, SupportsFloat, SupportsIndex
+from typing import TYPE_CHECKING, Any, Literal, SupportsFloat, SupportsIndex
 
 from rosasync.tracing import Trace, check_trace
 from rosasync.typing import Timeout
@@ -192,9 +193,12 @@ class Retry:
         backoff: the factor by which this wait grows with each further attempt.
         budget: how many requests of the service may be sent again for each call, 0.2 for one in
             five. Ten a second may be sent again besides. ``math.inf`` is no limit.
+        verify: ``async def verify()``, for services that may not run twice: called before the
+            request is sent again, to find out whether it has run. A response is the call's answer;
+            None sends it again; an exception is the call's error. It runs within the call's time.
 
     Raises:
-        TypeError: a value is not a number.
+        TypeError: a value is not a number, or ``verify`` is not callable.
         ValueError: a value is out of range.
     """
 
@@ -202,6 +206,7 @@ class Retry:
     after: float = 0.5
     backoff: float = 2.0
     budget: float = 0.2
+    verify: Callable[[], Awaitable[Any]] | None = None
 
     def __post_init__(self) -> None:
         _set(self, "attempts", check_count("attempts", self.attempts, 1))
@@ -212,6 +217,11 @@ class Retry:
         _set(self, "budget", _as_float("budget", self.budget, "a number"))
         if self.budget < 0:
             raise ValueError(f"budget must not be negative, got {self.budget!r}")
+        if self.verify is not None and not callable(self.verify):
+            raise TypeError(
+                "verify must be a coroutine function without arguments, not "
+                f"{type(self.verify).__name__}"
+            )
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any, Protocol
 
+from rosasync._client.call_errors import Refused
 from rosasync._client.retry import Action
 from rosasync._core.ports import PortDestroyed
+from rosasync._status.wire import Outcome
+from rosasync.errors import UsageError
 
 if TYPE_CHECKING:
     from rosasync._client.client import Client
     from rosasync._client.retry import Plan
     from rosasync._client.sent import Sent
+    from rosasync._status.wire import Report
     from rosasync.tracing import CallTrace
 
 __all__ = ["Call", "CallOwner"]
@@ -52,6 +56,7 @@ class Call:
     __slots__ = (
         "_fast",
         "_timer",
+        "_verifying",
         "client",
         "earlier",
         "future",
@@ -92,6 +97,8 @@ class Call:
         # Started by each attempt except the last, for the next one. Stopped by the next attempt,
         # by the loss of the servers, and by the end of the call.
         self._timer: asyncio.TimerHandle | None = None
+        # Runs `Retry.verify` before the next attempt. Cancelled by the end of the call.
+        self._verifying: asyncio.Task[Any] | None = None
         # Whether the next attempt is due because later requests were answered.
         self._fast = False
 
@@ -152,7 +159,7 @@ class Call:
             return
         if self.plan.on_later_answer() is Action.SEND:
             self._fast = True
-            self.owner.send_again(self)
+            self._send_again()
 
     def lose(self, lost: Sent, error: Callable[[], Exception]) -> None:
         """Take note that no server has an attempt any more.
@@ -160,22 +167,42 @@ class Call:
         If it was the last one, go to the next server if the plan allows it; otherwise set the
         error.
         """
-        outstanding = [sent for sent in self.outstanding() if sent is not lost]
-        self.newest = outstanding[-1] if outstanding else None
-        self.earlier = tuple(outstanding[:-1])
-        if outstanding or self.future.done():
+        if self._drop(lost) or self.future.done():
             return
         if self.plan is None or self.plan.on_servers_lost() is Action.FAIL:
             self.future.set_exception(error())
             return
         self._wait(None)
-        self.owner.send_again(self)
+        self._send_again()
+
+    def refuse(self, refused: Sent, report: Report) -> None:
+        """Take note that the servers of an attempt have reported not to answer it.
+
+        If it was the last one: a server that has closed is like one that is gone. A request that
+        was dropped is sent again when it is due, if the plan has an attempt left. All else ends the
+        call.
+        """
+        if report.outcome is Outcome.CLOSED:
+            self.lose(refused, lambda: Refused(report))
+            return
+        if self._drop(refused) or self.future.done():
+            return
+        dropped = report.outcome is Outcome.DROPPED
+        if not (dropped and self.plan is not None and self.plan.on_due() is Action.SEND):
+            self.future.set_exception(Refused(report))
 
     def outstanding(self) -> list[Sent]:
         """Return the attempts that may still be answered, in the order of their sends."""
         sent = self.client.window.sent
         attempts = self.earlier if self.newest is None else (*self.earlier, self.newest)
         return [attempt for attempt in attempts if attempt.number in sent]
+
+    def _drop(self, attempt: Sent) -> bool:
+        """Forget an attempt, and return whether another is outstanding."""
+        outstanding = [sent for sent in self.outstanding() if sent is not attempt]
+        self.newest = outstanding[-1] if outstanding else None
+        self.earlier = tuple(outstanding[:-1])
+        return bool(outstanding)
 
     def end(self, now: float) -> None:
         """Return what the call holds. Called once, by whoever is first:
@@ -199,6 +226,8 @@ class Call:
                 if sent.number in client.window.sent:
                     client.leave(sent, now)
             self._wait(None)
+            if self._verifying is not None:
+                self._verifying.cancel()
             client.retried.pop(self, None)
         # Break the reference cycles.
         self.newest = None
@@ -227,4 +256,31 @@ class Call:
     def _on_due(self) -> None:
         self._timer = None
         if not self.future.done() and self.plan is not None and self.plan.on_due() is Action.SEND:
+            self._send_again()
+
+    def _send_again(self) -> None:
+        """Send the call again, after `Retry.verify` has found that it did not run."""
+        assert self.plan is not None
+        if self.plan.verify is None:
             self.owner.send_again(self)
+        elif self._verifying is None:
+            self._verifying = self.future.get_loop().create_task(_verify(self.plan.verify))
+            self._verifying.add_done_callback(self._verified)
+
+    def _verified(self, task: asyncio.Task[Any]) -> None:
+        self._verifying = None
+        if self.future.done():
+            # Retrieved, so that asyncio does not log it: the call has ended meanwhile.
+            _ = task.cancelled() or task.exception()
+        elif task.cancelled():
+            self.future.set_exception(UsageError("Retry.verify was cancelled"))
+        elif (error := task.exception()) is not None:
+            self.future.set_exception(error)
+        elif task.result() is not None:
+            self.future.set_result(task.result())
+        else:
+            self.owner.send_again(self)
+
+
+async def _verify(verify: Callable[[], Awaitable[Any]]) -> Any:
+    return await verify()

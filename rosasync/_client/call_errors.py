@@ -8,21 +8,25 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from rosasync._core.text import duration
+from rosasync._status.wire import Outcome
 from rosasync.errors import (
     CallError,
     ContextShutdown,
+    HandlerFailed,
     PoolFull,
     QueueTimeout,
     ResponseTimeout,
     ServerGone,
+    ServerOverloaded,
     ServiceUnavailable,
 )
 
 if TYPE_CHECKING:
     from rosasync._client.retry import Plan
     from rosasync._core.ports import NodePort, Service
+    from rosasync._status.wire import Report
 
-__all__ = ["AllServersGone", "CallErrors", "NoServer"]
+__all__ = ["AllServersGone", "CallErrors", "NoServer", "Refused"]
 
 
 SETTLED = 1.0
@@ -38,6 +42,14 @@ class AllServersGone(Exception):
 
 class NoServer(Exception):
     """There was no server for as long as the call may wait for one."""
+
+
+class Refused(Exception):
+    """The server has reported that it will not answer. Callers get the error for the report."""
+
+    def __init__(self, report: Report) -> None:
+        super().__init__(report.outcome.value)
+        self.report = report
 
 
 class CallErrors:
@@ -84,6 +96,21 @@ class CallErrors:
     def server_gone(self, elapsed: float) -> CallError:
         """Return the error for a request whose servers have all vanished."""
         return self._make(ServerGone, "every server vanished before it answered", elapsed)
+
+    def refused(self, elapsed: float, report: Report) -> CallError:
+        """Return the error for a request that the server has reported not to answer."""
+        if report.outcome is Outcome.CLOSED:
+            return self._make(ServerGone, "the server closed before it answered", elapsed)
+        if report.outcome is Outcome.DROPPED:
+            message = "the server dropped the request, because too many were waiting there"
+            return self._make(ServerOverloaded, message, elapsed)
+        message = f"the handler failed: {report.error_type or 'it dropped the call unanswered'}"
+        error = self._make(
+            HandlerFailed, f"{message}: {report.error_message}".removesuffix(": "), elapsed
+        )
+        assert isinstance(error, HandlerFailed)
+        error.error_type, error.error_message = report.error_type, report.error_message
+        return error
 
     def client_destroyed(self) -> ContextShutdown:
         """Return the error for an rclpy client that something other than rosasync has destroyed."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Hashable
 from typing import TYPE_CHECKING, Any, Protocol
 
 from rosasync._client.sent import Sent
@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from rosasync._client.counts import Counts
     from rosasync._client.sent import Caller
     from rosasync._core.ports import ClientPort, Deliver, Servers
+    from rosasync._status.listener import Listener
+    from rosasync._status.wire import Report
     from rosasync.options import Limits
 
 __all__ = ["Client", "ClientOwner"]
@@ -64,6 +66,7 @@ class Client:
     """
 
     __slots__ = (
+        "_listener",
         "_loop",
         "_port",
         "_timer",
@@ -85,8 +88,10 @@ class Client:
         limits: Limits,
         counts: Counts,
         owner: ClientOwner,
+        listener: Listener,
     ) -> None:
         self._loop = asyncio.get_running_loop()
+        self._listener = listener
         self.window = Window(limits.in_flight, limits.grace)
         self.owner = owner
         self.counts = counts
@@ -101,10 +106,16 @@ class Client:
         self._timer: asyncio.TimerHandle | None = None
         self._timer_due = math.inf
         self._port = open_port(self._deliver)
+        listener.join(self._port.identity, self._on_report)
 
     def __repr__(self) -> str:
         state = "closed" if self.closed else "idle" if self.is_idle else "in use"
         return f"<Client {state}, {self.calls} calls, {self.window!r}>"
+
+    @property
+    def identity(self) -> Hashable:
+        """What servers know it by."""
+        return self._port.identity
 
     @property
     def is_idle(self) -> bool:
@@ -157,6 +168,10 @@ class Client:
         if self.closed or self._loop.is_closed():
             return
         self.window.leave(sent, now)
+        if self._listener.depart(self._port.identity, sent.number, sent.servers):
+            # All of its servers drop it, so it is no longer in a queue.
+            self.window.forgive(sent)
+            self.owner.on_places()
         self.set_timer()
 
     def on_servers(self, servers: Servers) -> None:
@@ -205,6 +220,7 @@ class Client:
         self.window.clear()
         if self._timer is not None:
             self._timer.cancel()
+        self._listener.leave(self._port.identity)
         self._port.close()
 
     def set_timer(self) -> None:
@@ -246,6 +262,26 @@ class Client:
             retried.on_later_answer(number)
         if self._timer is not None:
             self.set_timer()
+
+    def _on_report(self, report: Report) -> None:
+        """End a request that no server will answer, by what the last of them has reported.
+
+        A report of a request that is answered, or of a server that has not had it, says nothing.
+        """
+        sent = self.window.sent.get(report.number)
+        if sent is None or report.server not in sent.servers:
+            return
+        sent.servers -= {report.server}
+        if sent.servers:
+            # With several servers on the name, another may still answer.
+            return
+        self.window.remove(sent)
+        self._port.forget(sent.number)
+        call, sent.call = sent.call, None
+        if call is not None:
+            call.refuse(sent, report)
+        self.set_timer()
+        self.owner.on_places()
 
     def _on_timer(self, due: float) -> None:
         self._timer = None

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from rosasync._client.counts import Counts
     from rosasync._client.graph_watch import GraphWatch
     from rosasync._core.ports import NodePort, Servers, Service
+    from rosasync._status.listener import Listener
     from rosasync.options import Limits
 
 __all__ = ["Clients", "ClientsOwner"]
@@ -46,6 +47,7 @@ class Clients:
         errors: makes the errors of the service's calls.
         counts: the counters of the service.
         owner: the service. No client is evicted while it has callers that wait.
+        listener: the reports of servers that take part.
     """
 
     def __init__(
@@ -57,6 +59,7 @@ class Clients:
         errors: CallErrors,
         counts: Counts,
         owner: ClientsOwner,
+        listener: Listener,
     ) -> None:
         self.share = 0
         self.matching = Matching(service, node, watch, self)
@@ -67,6 +70,7 @@ class Clients:
         self._errors = errors
         self._counts = counts
         self._owner = owner
+        self._listener = listener
         self._loop = asyncio.get_running_loop()
         self._clients: list[Client] = []
         # The first client starts it. It stops when no client is left.
@@ -180,6 +184,7 @@ class Clients:
 
     def on_servers(self, servers: Servers) -> None:
         """React to the servers of a new generation, before anything is sent in it."""
+        self._listener.on_servers(servers)
         for client in self._clients:
             client.on_servers(servers)
 
@@ -226,6 +231,7 @@ class Clients:
             self._limits,
             self._counts,
             self._owner,
+            self._listener,
         )
         client.on_servers(self.matching.servers)
         self._clients.append(client)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from rosasync._client.sent import Sent
     from rosasync._core.aio import Deadlines
     from rosasync._core.ports import NodePort, Service
+    from rosasync._status.listener import Listener
     from rosasync.options import Limits
     from rosasync.tracing import ClientTracing
 
@@ -85,8 +86,9 @@ class Dispatch:
         counts: Counts,
         traces: ClientTracing,
         deadlines: Deadlines,
+        listener: Listener,
     ) -> None:
-        self.clients = Clients(service, node, limits, watch, errors, counts, self)
+        self.clients = Clients(service, node, limits, watch, errors, counts, self, listener)
         self.queue: dict[Waiter, None] = {}
         self.resends: dict[Call, None] = {}
         self.leased: dict[Call, None] = {}

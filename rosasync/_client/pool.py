@@ -13,6 +13,7 @@ from rosasync._client.latency import summarize
 from rosasync._client.service import MATCH_TIMEOUT, ServicePool
 from rosasync._client.service_watch import ServiceState, watch_servers
 from rosasync._core.aio import Deadlines
+from rosasync._status.listener import Listener
 from rosasync.errors import UsageError
 from rosasync.options import check_count, check_limits, check_timeout
 from rosasync.statistics import KeyStatistics, PoolStatistics, ServiceKey
@@ -60,6 +61,7 @@ class ClientPool:
         # Repeated calls find their service here by the type and name as given, unresolved.
         self._shortcuts: dict[tuple[Any, str], ServicePool] = {}
         self._deadlines = Deadlines()
+        self.listener = Listener(node)
         self._watch = GraphWatch(node, self._services.values(), on_shutdown)
         self._watchers: set[asyncio.Event] = set()
         self._ending: Callable[[], Exception] | None = None
@@ -214,6 +216,7 @@ class ClientPool:
                 self._watch,
                 self._deadlines,
                 self._tracing,
+                self.listener,
             )
             self._services[service.key, limits] = pool
         return pool
@@ -252,6 +255,7 @@ class ClientPool:
         self._deadlines.close()
         for service in self._services.values():
             service.end(ending)
+        self.listener.close()
         self._shortcuts.clear()
         self._wake_watchers()
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import enum
 import math
 import random
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+from collections.abc import Awaitable, Callable
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rosasync._client.counts import Counts
@@ -99,6 +99,11 @@ class Plan:
         self._later_answers = 0
         self.sent = 0
         self.over_budget = False
+
+    @property
+    def verify(self) -> Callable[[], Awaitable[Any]] | None:
+        """Finds out, before the request is sent again, whether it has run."""
+        return self._retry.verify
 
     def begin(self) -> Action:
         """Return SEND if an attempt may be sent now, and WAIT if not."""

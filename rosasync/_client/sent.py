@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     import asyncio
 
     from rosasync._core.ports import Servers
+    from rosasync._status.wire import Report
 
 __all__ = ["Caller", "Sent"]
 
@@ -32,6 +33,9 @@ class Caller(Protocol):
 
     def lose(self, lost: Sent, error: Callable[[], Exception]) -> None:
         """React to an attempt that no server has any more."""
+
+    def refuse(self, refused: Sent, report: Report) -> None:
+        """React to an attempt that its servers have reported not to answer."""
 
     def end(self, now: float) -> None:
         """Return what the call holds."""

@@ -12,7 +12,7 @@ from time import monotonic, monotonic_ns
 from typing import TYPE_CHECKING, Any
 
 from rosasync._client.call import Call
-from rosasync._client.call_errors import AllServersGone, CallErrors, NoServer
+from rosasync._client.call_errors import AllServersGone, CallErrors, NoServer, Refused
 from rosasync._client.counts import Counts
 from rosasync._client.dispatch import Dispatch, LeaseWaiter
 from rosasync._client.latency import LatencyHistogram, summarize
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from rosasync._client.client import Client
     from rosasync._client.graph_watch import GraphWatch
     from rosasync._core.ports import NodePort, Service
+    from rosasync._status.listener import Listener
     from rosasync.options import Limits, Retry
     from rosasync.tracing import Outcome, Tracing
 
@@ -55,6 +56,7 @@ class ServicePool:
         watch: GraphWatch,
         deadlines: Deadlines,
         tracing: Tracing,
+        listener: Listener,
     ) -> None:
         self.service = service
         self.latencies = LatencyHistogram()
@@ -68,7 +70,15 @@ class ServicePool:
         self._counts = Counts()
         self._budget = RetryBudget(self._counts, self._loop.time)
         self._dispatch = Dispatch(
-            service, node, limits, watch, self._errors, self._counts, self._traces, deadlines
+            service,
+            node,
+            limits,
+            watch,
+            self._errors,
+            self._counts,
+            self._traces,
+            deadlines,
+            listener,
         )
         self._clients = self._dispatch.clients
         self._mismatch = MismatchReporter(service, node)
@@ -405,6 +415,8 @@ class ServicePool:
                 return self._errors.response_timeout(elapsed, call.plan)
             case AllServersGone():
                 return self._errors.server_gone(elapsed)
+            case Refused(report=report):
+                return self._errors.refused(elapsed, report)
             case PortDestroyed():
                 return self._errors.client_destroyed()
             case Exception() if not self._node.ok():

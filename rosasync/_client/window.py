@@ -165,6 +165,11 @@ class Window:
         self.supersede(sent)
         self._leaving.append((now + self._grace, sent))
 
+    def forgive(self, sent: Sent) -> None:
+        """Give the place of a request back that its servers drop; its response may still come."""
+        self._free(sent)
+        sent.leased = False
+
     def remove(self, sent: Sent) -> None:
         """Forget a request and give its place back."""
         self.sent.pop(sent.number, None)

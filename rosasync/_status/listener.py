@@ -66,6 +66,11 @@ class Listener:
             if self._node.count_publishers(report_topic(name)):
                 self._processes[name] = _Process(self._node, name, self._on_message)
 
+    def hears(self, servers: Servers) -> bool:
+        """Return whether all of these servers take part, and both sides are matched."""
+        processes = [self._processes.get(process_of(server) or "") for server in servers]
+        return bool(processes) and all(p is not None and p.is_matched() for p in processes)
+
     def depart(self, client: Hashable, number: int, servers: Servers) -> bool:
         """Tell the servers of a request that its caller has left.
 
@@ -113,12 +118,19 @@ class _Process:
             DiagnosticStatus, report_topic(name), BURST, on_message
         )
 
+    def is_matched(self) -> bool:
+        """Return whether departures are received, and reports would be."""
+        try:
+            return bool(self._departures.subscriptions() and self._reports.publishers())
+        except (PortDestroyed, ContextShutdown):
+            return False
+
     def tell(self, client: bytes, number: int) -> bool:
         """Publish a departure, and return whether the process receives it."""
+        if not self.is_matched():
+            return False
         departure = Departure(client, number)
         try:
-            if not self._departures.subscriptions():
-                return False
             self._departures.publish(self._node.make_message(self._type, departure.to_mapping()))
         except (PortDestroyed, ContextShutdown):
             return False

@@ -15,6 +15,7 @@ from rosasync._client.counts import Counts
 from rosasync._client.retry import Plan, RetryBudget
 from rosasync._client.sent import Sent
 from rosasync._core.aio import Deadlines, Expired
+from rosasync._status.listener import Listener
 from rosasync.statistics import ServiceKey
 from rosasync.testing import FakeClient, FakeGraph, FakeNode
 from tests.support.nodes import reports
@@ -32,7 +33,8 @@ class ClientUnderTest:
         self.leased: list[object] = []
         self.reported = 0
         self.dropped: list[Client] = []
-        self.client = Client(self._open, Limits(**limits), self.counts, self)
+        listener = Listener(self.node)
+        self.client = Client(self._open, Limits(**limits), self.counts, self, listener)
         self.budget = RetryBudget(self.counts, asyncio.get_running_loop().time)
         self._deadlines = Deadlines()
 
