@@ -113,7 +113,7 @@ FIRST = {
 }
 """What is searched for, and the page that has to come first."""
 
-FEW = 16
+FEW = 20
 """A search that finds more pages than these does not help."""
 
 
