@@ -13,7 +13,7 @@ import typer
 from matplotlib.figure import Figure
 from rich.progress import Progress
 
-from benchmarks import cold, crash, faults, overload, sharing
+from benchmarks import actions, cold, crash, faults, overload, sharing
 from benchmarks.hosts import NoHosts
 from benchmarks.pages import replace_section
 from benchmarks.tables import make_console, make_table
@@ -38,6 +38,7 @@ def add_commands(app: typer.Typer) -> None:
     app.command("overload")(overload_server)
     app.command("faults")(fail)
     app.command("cold")(start)
+    app.command("actions")(act)
     app.command("publish")(publish)
 
 
@@ -164,6 +165,22 @@ def replace(restarts: int, before: Path | None, json: Path | None) -> None:
     make_console().print(make_table("", crash.heading, crash.rows(found)))
 
 
+def act(
+    rounds: Annotated[int, typer.Option(min=1, help="Rounds; the medians count.")] = 5,
+    scale: Annotated[
+        float, typer.Option(min=0.001, max=1.0, help="Less than 1 for fewer goals.")
+    ] = 1.0,
+    json: Json = None,
+) -> None:
+    """Goals of actions: latency, goals at once, feedback and memory, beside rclpy's."""
+    isolate()
+    trials = Trials(actions.COMMAND, {"rounds": rounds, "scale": scale})
+    total = actions.total(rounds)
+    with collected(trials, actions.heading, actions.row, total, json) as add:
+        figures = actions.measure(rounds, scale, add)
+    show_goals(actions.goals(figures))
+
+
 def publish(
     files: Annotated[list[Path], typer.Argument(exists=True, help="Trials saved with --json.")],
     out: Annotated[Path, typer.Option(help="The documentation's folder.")] = Path("docs"),
@@ -185,6 +202,8 @@ def section(trials: Trials, out: Path) -> str:
     """Return the section of these trials, after drawing its plot."""
     if trials.command == faults.COMMAND:
         return faults.section(trials)
+    if trials.command == actions.COMMAND:
+        return actions.section(trials)
     if trials.command == crash.COMMAND:
         return crash.section(trials)
     picture = f"benchmarks/{trials.command}.svg"

@@ -113,6 +113,8 @@ class ActionClient:
         self._owner = owner
         self._types = action.action_type.Impl
         self._goals: dict[bytes, ActiveGoal] = {}
+        # The background tasks that cancel goals.
+        self._endings: set[asyncio.Task[None]] = set()
         self._results = ResultRequests(
             node, action.get_result, self._make_result_request, self._on_result
         )
@@ -143,6 +145,7 @@ class ActionClient:
 
     def is_provided(self) -> bool:
         """Return whether the graph shows a server."""
+        self._servers = None
         return bool(self._find_servers())
 
     def make_goal(self, goal: Any) -> Any:
@@ -265,6 +268,8 @@ class ActionClient:
         if goal.ending is None or goal.ending.done():
             # Done: the end of the loop cancels every task, and the session then closes.
             goal.ending = self._loop.create_task(self._end_abandoned(goal))
+            self._endings.add(goal.ending)
+            goal.ending.add_done_callback(self._endings.discard)
         return goal.ending
 
     async def _end_abandoned(self, goal: ActiveGoal) -> None:
@@ -299,7 +304,7 @@ class ActionClient:
         """
         delay = AGAIN_MIN
         while goal.outcome is None:
-            answered = goal.answered.is_set()
+            answered = goal.is_answered
             try:
                 answer = await self._request_cancel(goal, CANCEL_TIMEOUT)
             except CallError:
@@ -318,12 +323,10 @@ class ActionClient:
                 return False
             if answer is CancelAnswer.UNKNOWN and answered and self._has_one_server():
                 return False
-            if not goal.answered.is_set():
-                with suppress(TimeoutError):
-                    async with asyncio.timeout(delay):
-                        await goal.answered.wait()
-            else:
+            if goal.acceptance is None or goal.acceptance.done():
                 await asyncio.sleep(delay)
+            else:
+                await asyncio.wait((goal.acceptance,), timeout=delay)
             delay = min(2 * delay, AGAIN_MAX)
         return False
 
@@ -365,9 +368,10 @@ class ActionClient:
         """End every goal with an error, and destroy the ports; idempotent."""
         for goal in self.goals:
             self._settle(goal, Outcome(goal.status, make_error=make_error))
-            for task in (goal.acceptance, goal.ending):
-                if task is not None:
-                    task.cancel()
+            if goal.acceptance is not None:
+                goal.acceptance.cancel()
+        for task in self._endings:
+            task.cancel()
         self._close_ports()
 
     # The goals that are out.
@@ -557,12 +561,15 @@ class ActionClient:
         goal.answered.set()
 
     def _rejected(self, goal: ActiveGoal) -> None:
-        if not self._has_one_server():
-            # Another server of the name may have accepted it.
-            goal.status = GoalStatus.ACCEPTED
-            self.abandon(goal)
         error = self.errors.goal(GoalRejected, goal, "the server rejected the goal")
         self._settle(goal, Outcome(GoalStatus.UNKNOWN, make_error=lambda: error))
+        if not self._has_one_server():
+            # Another server of the name may have accepted it.
+            other = ActiveGoal(goal.id, goal.started)
+            other.update(GoalStatus.ACCEPTED)
+            self._add(other)
+            self._ask(other)
+            self.abandon(other)
 
     # What servers send.
 

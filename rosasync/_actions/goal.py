@@ -52,7 +52,7 @@ class ActiveGoal:
         accepted_at: when the server accepted it, in ns; None before, and for an attached goal.
         acceptance: the task that sends the goal and takes the answer; None if it was not sent by
             this session.
-        answered: set when the server has answered to it, or when the session closes.
+        answered: set when `acceptance` has ended, or when the session closes.
         servers: those that may have the goal; None before its acceptance.
         outcome: how it has ended.
         settled: set with the outcome.
@@ -112,6 +112,15 @@ class ActiveGoal:
     def is_accepted(self) -> bool:
         """Whether the server is known to have it."""
         return self.status is not GoalStatus.UNKNOWN
+
+    @property
+    def is_answered(self) -> bool:
+        """Whether the server has answered to it, so that it knows the goal or never will."""
+        acceptance = self.acceptance
+        if self.is_accepted or acceptance is None:
+            return True
+        # If it was cancelled, the answer may be on its way.
+        return acceptance.done() and not acceptance.cancelled()
 
     @property
     def has_readers(self) -> bool:

@@ -72,6 +72,11 @@ class Actions:
         # Needs no lock: each access is a single operation, which is atomic.
         self._known: dict[tuple[Any, str], Action] = {}
 
+    @property
+    def out(self) -> int:
+        """How many goals are out."""
+        return sum(len(client.goals) for client in self._clients.values())
+
     def check_open(self) -> None:
         """Raise the error that callers get, once the session has begun to close."""
         if self._closing is not None:
@@ -160,7 +165,11 @@ class Actions:
         queue = client.make_queue(feedback)
         goal.started = self._loop.time()
         goal.join(queue)
-        await client.send(goal, arguments.message, arguments.accept_timeout, arguments.wait)
+        try:
+            await client.send(goal, arguments.message, arguments.accept_timeout, arguments.wait)
+        except BaseException:
+            goal.leave(queue)
+            raise
         cancelled = False
         try:
             yield Goal(client, goal, queue, self._timeout)

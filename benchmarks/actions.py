@@ -1,0 +1,235 @@
+"""Goals of actions: rosasync's client and server, and rclpy's, in every combination."""
+
+from __future__ import annotations
+
+import statistics
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+
+from benchmarks.action_server import SLOWLY
+from benchmarks.pages import markdown_table
+from benchmarks.pipes import READY, ROOT, Child, await_line
+from benchmarks.trials import Goal, Trials, check
+
+__all__ = ["COMMAND", "Figure", "goals", "heading", "measure", "row", "section", "total"]
+
+COMMAND = "actions"
+OURS, STOCK = "rosasync", "stock"
+CLIENTS = SERVERS = (OURS, STOCK)
+TIMEOUT = 120.0
+OTHERS = 20
+
+ONE, TEN, FIFTY = "goal to result, ms", "10 at once, goals/s", "50 at once, goals/s"
+FEEDBACK, BESIDE = "feedback at 1 kHz, CPU %", f"beside {OTHERS} others' feedback, CPU %"
+GROWTH = "memory from 1,000 to 10,000 goals, MB"
+WHAT = (ONE, TEN, FIFTY, FEEDBACK, BESIDE, GROWTH)
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One figure of one round.
+
+    Attributes:
+        what: which, with its unit.
+        client: whose client, and `server` whose server.
+        value: None if the goals did not end; `problem` says why.
+        lost: feedback messages that did not come, of those that were published.
+    """
+
+    what: str
+    client: str
+    server: str
+    value: float | None
+    problem: str = ""
+    lost: int = 0
+
+
+def total(rounds: int) -> int:
+    """Return how many figures `measure` finds."""
+    return len(CLIENTS) * len(SERVERS) * (rounds * (len(WHAT) - 1) + 1)
+
+
+def measure(
+    rounds: int, scale: float, on_figure: Callable[[Figure], object] = lambda figure: None
+) -> list[Figure]:
+    """Measure every combination, round by round.
+
+    Args:
+        rounds: how often; the medians count.
+        scale: 1 for the numbers that the figures are named after; less for a trial.
+        on_figure: called with each figure.
+    """
+    found: list[Figure] = []
+    for number in range(rounds):
+        for server in SERVERS:
+            for client in CLIENTS:
+                with _server(server), Child("benchmarks.action_client", client) as child:
+                    last = number == rounds - 1
+                    for figure in _round(child, client, server, scale, last):
+                        found.append(figure)
+                        on_figure(figure)
+    return found
+
+
+def _round(
+    child: Child, client: str, server: str, scale: float, with_growth: bool
+) -> Iterator[Figure]:
+    def ask(count: int, at_once: int, order: int = 0) -> dict[str, float]:
+        count = max(at_once, round(count * scale))
+        answer = child.ask("goals", timeout=TIMEOUT, count=count, at_once=at_once, order=order)
+        return {**answer, "count": float(count)}
+
+    def one() -> float:
+        answer = ask(300, 1)
+        return 1000 * answer["seconds"] / answer["count"]
+
+    def several(at_once: int) -> float:
+        answer = ask(2000, at_once)
+        return answer["count"] / answer["seconds"]
+
+    def feedback() -> tuple[float, int]:
+        order = round(5000 * scale)
+        answer = child.ask("goals", timeout=TIMEOUT, count=1, at_once=1, order=order)
+        return 100 * answer["cpu"] / answer["seconds"], order - int(answer["received"])
+
+    def beside() -> float:
+        # The others have 100 messages a second each, this client's goal has the same.
+        order = SLOWLY + round(500 * scale)
+        with Child("benchmarks.action_client", OURS) as others:
+            others.ask("goals", timeout=TIMEOUT, count=1, at_once=1, order=0)
+            with _asked(others, count=OTHERS, at_once=OTHERS, order=order + 100):
+                answer = child.ask("goals", timeout=TIMEOUT, count=1, at_once=1, order=order)
+        return 100 * answer["cpu"] / answer["seconds"]
+
+    def growth() -> float:
+        ask(1000, 10)
+        before = child.ask("memory", timeout=TIMEOUT)["bytes"]
+        ask(9000, 10)
+        return (child.ask("memory", timeout=TIMEOUT)["bytes"] - before) / 1e6
+
+    work: dict[str, Callable[[], float | tuple[float, int]]] = {
+        ONE: one,
+        TEN: lambda: several(10),
+        FIFTY: lambda: several(50),
+        FEEDBACK: feedback,
+        BESIDE: beside,
+    }
+    if with_growth:
+        work[GROWTH] = growth
+    ask(50, 10)
+    for what, measured in work.items():
+        try:
+            value = measured()
+        except Exception as error:
+            # A client whose goals never end can measure nothing more.
+            for left in list(work)[list(work).index(what) :]:
+                yield Figure(left, client, server, None, str(error))
+            return
+        figure, lost = value if isinstance(value, tuple) else (value, 0)
+        yield Figure(what, client, server, figure, lost=lost)
+
+
+heading = ["", "client", "server", "", "feedback lost"]
+
+
+def row(figure: Figure) -> list[str]:
+    """Return the row of one figure."""
+    value = figure.problem if figure.value is None else f"{figure.value:.3g}"
+    lost = str(figure.lost) if figure.what == FEEDBACK else ""
+    return [figure.what, figure.client, figure.server, value, lost]
+
+
+def goals(figures: Sequence[Figure]) -> list[Goal]:
+    """Compare the medians with the goals."""
+    found = [
+        _ratio(figures, ONE, OURS, "<=", 0.6),
+        _ratio(figures, ONE, STOCK, "<=", 0.9),
+        *(_ratio(figures, what, OURS, ">=", 3.0) for what in (TEN, FIFTY)),
+        *(_ratio(figures, what, STOCK, ">=", 1.3) for what in (TEN, FIFTY)),
+    ]
+    for what in (TEN, FIFTY):
+        ours, stock = (_median(figures, what, OURS, server) for server in SERVERS)
+        ratio = ours / stock if ours and stock else None
+        found.append(check(f"{what}: our server / rclpy's, our client", ratio, ">=", 1.5))
+    for what in (FEEDBACK, BESIDE):
+        found += [_ratio(figures, what, server, "<=", 0.5) for server in SERVERS]
+    for server in SERVERS:
+        growth = _median(figures, GROWTH, OURS, server)
+        found.append(check(f"{GROWTH}, with the server of {server}", growth, "<=", 1.0))
+    return found
+
+
+def section(trials: Trials) -> str:
+    """Return the section of the documentation's page."""
+    figures = [Figure(**found) for found in trials.rows]
+    table = []
+    for what in WHAT:
+        for server in SERVERS:
+            ours, stock = (_median(figures, what, client, server) for client in CLIENTS)
+            ratio = f"{ours / stock:.2g}" if ours and stock and what != GROWTH else "-"
+            table.append([what, server, _text(ours), _text(stock), ratio])
+    return "\n".join(
+        (
+            "## Actions\n",
+            "`python -m benchmarks actions`. Goals of an action of another process: of rosasync's "
+            "client, and of rclpy's `ActionClient` with its executor in a thread, with each "
+            "server (rclpy's in a `MultiThreadedExecutor`). A goal does nothing, unless it is "
+            "about feedback. Medians of the rounds.\n",
+            f"{trials.conditions}\n",
+            markdown_table(["", "server", "rosasync", "rclpy", "rosasync / rclpy"], table),
+        )
+    )
+
+
+def _ratio(figures: Sequence[Figure], what: str, server: str, sense: str, bound: float) -> Goal:
+    ours, stock = (_median(figures, what, client, server) for client in CLIENTS)
+    ratio = ours / stock if ours is not None and stock else None
+    return check(f"{what}: ours / rclpy's, server of {server}", ratio, sense, bound)
+
+
+def _median(figures: Sequence[Figure], what: str, client: str, server: str) -> float | None:
+    wanted = (what, client, server)
+    values = [f.value for f in figures if (f.what, f.client, f.server) == wanted]
+    measured = [value for value in values if value is not None]
+    return statistics.median(measured) if measured else None
+
+
+def _text(value: float | None) -> str:
+    return "never ended" if value is None else f"{value:.3g}"
+
+
+@contextmanager
+def _server(kind: str) -> Iterator[None]:
+    """Run an action server in the block."""
+    with ExitStack() as stack:
+        process = stack.enter_context(
+            subprocess.Popen(
+                (sys.executable, "-m", "benchmarks.action_server", kind),
+                cwd=ROOT,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+            )
+        )
+        stack.callback(process.kill)
+        assert process.stdout is not None
+        if not await_line(process.stdout, READY):
+            raise RuntimeError(f"the action server of {kind} did not start")
+        yield
+        assert process.stdin is not None
+        process.stdin.close()
+        process.wait(10.0)
+
+
+@contextmanager
+def _asked(child: Child, **message: int) -> Iterator[None]:
+    """Let a child work on a message while the block runs."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    with ThreadPoolExecutor(1) as pool:
+        future = pool.submit(lambda: child.ask("goals", timeout=TIMEOUT, **message))
+        yield
+        future.result()
