@@ -22,7 +22,9 @@ from benchmarks.pipes import Message, answer_lines
 __all__ = ["Ours", "Stock"]
 
 PATIENCE = 30.0
-"""Seconds for the goals of one figure, or for one goal."""
+"""Seconds for one goal."""
+STALLED = 10.0
+"""Seconds without any result after which the goals of rclpy's client are given up."""
 
 
 def cpu_seconds() -> float:
@@ -102,7 +104,7 @@ class Stock:
 
     def goals(self, count: int, at_once: int, order: int) -> int:
         """Run goals, and return how many feedback messages came."""
-        left, out, received = count, 0, 0
+        left, out, received, results = count, 0, 0, 0
         done = threading.Event()
 
         def on_feedback(feedback: Any) -> None:
@@ -123,8 +125,9 @@ class Stock:
             future.result().get_result_async().add_done_callback(ended)
 
         def ended(future: Any) -> None:
-            nonlocal out
+            nonlocal out, results
             out -= 1
+            results += 1
             if left > 0:
                 send()
             elif not out:
@@ -135,8 +138,11 @@ class Stock:
                 send()
 
         self._executor.create_task(begin)
-        if not done.wait(PATIENCE):
-            raise TimeoutError(f"{out} goals of rclpy's client never ended")
+        seen = -1
+        while not done.wait(STALLED if not order else PATIENCE):
+            if results == seen:
+                raise TimeoutError(f"{out} goals of rclpy's client never ended")
+            seen = results
         return received
 
     def close(self) -> None:

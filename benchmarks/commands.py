@@ -166,7 +166,7 @@ def replace(restarts: int, before: Path | None, json: Path | None) -> None:
 
 
 def act(
-    rounds: Annotated[int, typer.Option(min=1, help="Rounds; the medians count.")] = 5,
+    rounds: Annotated[int, typer.Option(min=1, help="Rounds; the medians count.")] = 3,
     scale: Annotated[
         float, typer.Option(min=0.001, max=1.0, help="Less than 1 for fewer goals.")
     ] = 1.0,

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from benchmarks import (
+    actions,
     callers,
     cold,
     commands,
@@ -240,6 +241,36 @@ def test_the_goals_of_faults() -> None:
     assert "next answer after 1.5 s" in faults.row(found[2])[-1]
 
 
+def figure(what: str, client: str, value: float | None, server: str = "stock") -> actions.Figure:
+    """Return a figure of the command `actions`."""
+    return actions.Figure(what, client, server, value, "" if value else "never ended")
+
+
+def test_the_goals_of_actions() -> None:
+    found = [
+        figure(actions.ONE, "rosasync", 3.0),
+        figure(actions.ONE, "stock", 6.0),
+        figure(actions.TEN, "rosasync", 200.0),
+        figure(actions.TEN, "rosasync", 400.0, "rosasync"),
+        figure(actions.TEN, "stock", 200.0),
+        figure(actions.FIFTY, "rosasync", 200.0),
+        figure(actions.FIFTY, "stock", None),
+    ]
+    met = {goal.name: goal.met for goal in actions.goals(found)}
+    assert met["goal to result, ms: ours / rclpy's, server of stock <= 0.9"] is True
+    assert met["10 at once, goals/s: ours / rclpy's, server of stock >= 1.3"] is False
+    assert met["10 at once, goals/s: our server / rclpy's, our client >= 1.5"] is True
+    assert met["50 at once, goals/s: ours / rclpy's, server of stock >= 1.3"] is None
+    assert actions.row(found[-1])[3] == "never ended"
+
+
+@pytest.mark.slow
+def test_actions_are_measured() -> None:
+    found = actions.measure(1, 0.02)
+    assert len(found) == actions.total(1)
+    assert all(figure.value is not None for figure in found if figure.client == "rosasync")
+
+
 def test_trials_are_published_between_their_marks(tmp_path: Path) -> None:
     machine = {**MACHINE, "versions": {"rclpy": "7"}}
     starts = [cold.Start("rosasync script", 0.5), cold.Start("rosasync script", None)]
@@ -248,6 +279,7 @@ def test_trials_are_published_between_their_marks(tmp_path: Path) -> None:
         ("faults", [faults.Fault(faults.SLOW, "direct", 8, 1.0, {"answered": 24}, plain_lost=0)]),
         ("cold", starts),
         ("crash", [crash.Restart("client", "stock", 2.5), crash.Restart("client", "stock", None)]),
+        ("actions", [figure(actions.ONE, "rosasync", 3.0), figure(actions.ONE, "stock", 6.0)]),
     ]
     files: list[Path] = []
     for command, rows_of in kinds:
@@ -268,7 +300,8 @@ def test_trials_are_published_between_their_marks(tmp_path: Path) -> None:
     written = {path.name for path in (tmp_path / "benchmarks").iterdir()}
     assert "| stock | client | 2 | 2.50 | 2.50 | 1 | 1 |" in text
     assert written == {"sharing.svg", "cold.svg"}
-    assert len(pages.marked_sections(text)) == 4
+    assert "| goal to result, ms | stock | 3 | 6 | 0.5 |" in text
+    assert len(pages.marked_sections(text)) == 5
     page.write_text("{}")
     with pytest.raises(ValueError, match="not the trials"):
         Trials.load([page])
