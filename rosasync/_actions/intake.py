@@ -58,6 +58,8 @@ class GoalIntake:
         self.rejected = 0
         self.closed = False
         self._name = name
+        # For the warning of a handler that blocks the loop.
+        self.__qualname__ = getattr(on_goal, "__qualname__", "of rosasync")
         self._on_goal = on_goal
         self._goals = goals
         self._runner = runner

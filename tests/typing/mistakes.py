@@ -76,6 +76,22 @@ def ticks(session: rosasync.Session, by_name: Any) -> None:
     print(proxy.get_response().message)  # E: None until it is there
 
 
+async def wrong_result(goal: rosasync.ServerGoal[Fibonacci.Goal, Fibonacci.Feedback]) -> int:
+    print(goal.request.ordr)  # E: no such field
+    goal.feedback(Fibonacci.Result())  # E: a result
+    return 3
+
+
+def action_servers(session: rosasync.Session) -> None:
+    session.serve_action(Fibonacci, "/fibonacci", wrong_result)  # E (mypy): no result
+    session.serve_action(SetBool, "/fibonacci", wrong_result)  # E: a service type
+    session.serve_action(Fibonacci, "/fibonacci", drive, on_busy="wait")  # E: no such choice
+
+
+async def drive(goal: rosasync.ServerGoal[Fibonacci.Goal, Fibonacci.Feedback]) -> Fibonacci.Result:
+    return Fibonacci.Result()
+
+
 async def goals(session: rosasync.Session) -> None:
     result = await session.act(Fibonacci, "/fibonacci", {"order": 8})
     print(result.sequenc)  # E: no such field

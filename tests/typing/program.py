@@ -159,6 +159,32 @@ async def goals(session: rosasync.Session) -> None:
         assert_type(named, Goal[Any, Any])
 
 
+async def drive(
+    goal: rosasync.ServerGoal[Fibonacci.Goal, Fibonacci.Feedback],
+) -> Fibonacci.Result:
+    goal.feedback(Fibonacci.Feedback(sequence=[goal.request.order]))
+    goal.feedback({"sequence": [1]})
+    return Fibonacci.Result()
+
+
+async def drive_with_mapping(goal: rosasync.ServerGoal[Any, Any]) -> dict[str, Any]:
+    return {"sequence": [goal.request.order]}
+
+
+async def is_possible(request: Fibonacci.Goal) -> bool:
+    return bool(request.order > 0)
+
+
+async def action_servers(session: rosasync.Session) -> None:
+    server = session.serve_action(
+        Fibonacci, "/fibonacci", drive, on_goal=is_possible, on_busy="replace", result_timeout=None
+    )
+    assert_type(server, rosasync.ActionServer[Fibonacci.Goal, Fibonacci.Result, Fibonacci.Feedback])
+    session.serve_action(Fibonacci, "/fibonacci", drive_with_mapping, on_error=lambda g, e: None)
+    async with session.serve_action(ACTION, "/fibonacci", drive_with_mapping) as named:
+        assert_type(named, rosasync.ActionServer[Any, Any, Any])
+
+
 def goals_of_threads(session: rosasync.Session) -> None:
     assert_type(session.from_thread.act(Fibonacci, "/fibonacci"), Fibonacci.Result)
     assert_type(session.from_thread.act(ACTION, "/fibonacci"), Any)
