@@ -82,7 +82,10 @@ def overload_server(
     polite: Annotated[bool, typer.Option(help="Also a polite caller beside a flood.")] = True,
     recovery: Annotated[bool, typer.Option(help="Also the end of an overload.")] = True,
     everything: Annotated[
-        bool, typer.Option("--all", help="All clients, servers, work, timeouts and processes.")
+        bool,
+        typer.Option(
+            "--all", help="All clients, servers, work, timeouts and processes: takes hours."
+        ),
     ] = False,
     seconds: Annotated[float, typer.Option(min=0.1, help="Seconds for each row.")] = 4.0,
     json: Json = None,

@@ -378,7 +378,7 @@ def goals(cells: Sequence[Cell]) -> list[Goal]:
         ),
         check("rosasync → stock, overloaded: waste", _most(c.waste for c in to_stock), "<=", 0.05),
         check(
-            "stock → rosasync, overloaded: goodput / a stock server's", _ratio(loaded), ">=", 1.0
+            "stock → rosasync, overloaded: answers/s / a stock server's", _ratio(loaded), ">=", 1.0
         ),
         check(
             "rosasync → rosasync, overloaded: goodput", _least(c.wanted for c in own), ">=", 0.97
@@ -411,7 +411,10 @@ def goals(cells: Sequence[Cell]) -> list[Goal]:
 
 
 def _ratio(cells: Iterable[Cell]) -> float | None:
-    """Return the lowest goodput of stock clients with our server, divided by a stock server's."""
+    """Return the fewest answers/s of stock clients from our server, divided by a stock server's.
+
+    Not the goodput, because the capacities were measured at other times.
+    """
     by_place: dict[tuple[Any, ...], dict[str, float]] = {}
     for cell in cells:
         if cell.client == "stock":
@@ -423,11 +426,11 @@ def _ratio(cells: Iterable[Cell]) -> float | None:
                 cell.timeouts,
                 cell.processes,
             )
-            by_place.setdefault(place, {})[cell.server] = cell.goodput
+            by_place.setdefault(place, {})[cell.server] = cell.answered / cell.seconds
     return _least(
-        goodput / found["stock"]
+        rate / found["stock"]
         for found in by_place.values()
-        for server, goodput in found.items()
+        for server, rate in found.items()
         if server != "stock" and found.get("stock")
     )
 
