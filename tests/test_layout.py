@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 import tomllib
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -47,6 +48,19 @@ def test_the_inside_imports_no_user_of_the_public_api(room: str) -> None:
         if found.startswith(above)
     ]
     assert not offenders
+
+
+def test_imports_make_no_circle() -> None:
+    # Also those for type checkers: who has to know whom is the same question.
+    graph = {
+        name: {found for found in _imported_modules(file) if found != name}
+        for name, file in FILES.items()
+        if name != "rosasync.__init__"
+    }
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail(f"imports make a circle: {' -> '.join(error.args[1])}")
 
 
 def test_the_design_page_lists_every_file() -> None:

@@ -9,8 +9,8 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
+from rosasync._actions.active_goal import ActiveGoal, FeedbackQueue, Outcome
 from rosasync._actions.errors import GoalErrors
-from rosasync._actions.goal import ActiveGoal, FeedbackQueue, Outcome
 from rosasync._actions.results import ResultRequests
 from rosasync._actions.status import TERMINAL, GoalStatus, read_statuses, uuid_bytes, uuid_of
 from rosasync._core.aio import start_task

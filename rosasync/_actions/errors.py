@@ -9,7 +9,7 @@ from rosasync._core.text import duration
 from rosasync.errors import CallError, GoalError, ServerGone, ServiceUnavailable
 
 if TYPE_CHECKING:
-    from rosasync._actions.goal import ActiveGoal
+    from rosasync._actions.active_goal import ActiveGoal
     from rosasync._core.ports import Action, NodePort
 
 __all__ = ["GoalErrors"]

@@ -10,8 +10,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 from uuid import UUID, uuid4
 
+from rosasync._actions.active_goal import ActiveGoal
 from rosasync._actions.client import ActionClient
-from rosasync._actions.goal import ActiveGoal, Goal
+from rosasync._actions.goal import Goal
 from rosasync.errors import CallError, GoalTimeout
 from rosasync.options import check_count, check_seconds, check_timeout
 

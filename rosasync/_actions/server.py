@@ -266,7 +266,7 @@ class ActionServer(Generic[GoalT, ResultT, FeedbackT]):
                 "message or a mapping of its fields"
             )
         result = self._node.make_message(self._action.action_type.Result, value)
-        # It is sent to whoever asks for it, and the handler may use its messages again.
+        # It is sent to every client that asks for it, and the handler may use its messages again.
         return deepcopy(result)
 
     def _publish_feedback(self, goal_id: bytes, value: Any) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, Generic
+from typing import TYPE_CHECKING, Any, Generic, Protocol
 from uuid import UUID
 
 from rosasync._actions.status import GoalStatus
@@ -12,9 +12,31 @@ from rosasync.typing import FeedbackT, GoalT
 
 if TYPE_CHECKING:
     from rosasync._actions.goal_table import GoalRecord
-    from rosasync._actions.server import ActionServer
+    from rosasync.statistics import ActionServerStatistics
 
-__all__ = ["ServerGoal"]
+__all__ = ["AcceptingServer", "ServerGoal"]
+
+
+class AcceptingServer(Protocol):
+    """The server of a goal: an `ActionServer`, which this module cannot import."""
+
+    @property
+    def action_name(self) -> str:
+        """The resolved name of the action."""
+
+    @property
+    def action_type(self) -> str:
+        """The name of the action type."""
+
+    @property
+    def closed(self) -> bool:
+        """Whether the server has been closed, or its closing has begun."""
+
+    def statistics(self) -> ActionServerStatistics:
+        """Return a snapshot."""
+
+    async def aclose(self, timeout: float | None = ...) -> None:
+        """End the server."""
 
 
 class ServerGoal(Generic[GoalT, FeedbackT]):
@@ -22,7 +44,7 @@ class ServerGoal(Generic[GoalT, FeedbackT]):
 
     Attributes:
         request: the goal message that the client sent.
-        server: the server.
+        server: the `ActionServer` that accepted it.
         id: its id, which the client has chosen.
     """
 
@@ -30,7 +52,7 @@ class ServerGoal(Generic[GoalT, FeedbackT]):
 
     def __init__(
         self,
-        server: ActionServer[GoalT, Any, FeedbackT],
+        server: AcceptingServer,
         record: GoalRecord,
         request: GoalT,
         publish: Callable[[bytes, Any], None],

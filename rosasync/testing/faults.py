@@ -7,16 +7,18 @@ from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Generic
+from typing import TYPE_CHECKING, Any, Generic, TypeAlias
 
 from rosasync._core.ports import PortDestroyed, Undeliverable, Unmatched
 from rosasync.typing import RequestT, ResponseT
 
 if TYPE_CHECKING:
     from rosasync._core.ports import DeliverRequest, RequestHeader, Service, ServicePort
-    from rosasync.testing.hooks import OpenService
 
-__all__ = ["Faults", "FaultyService", "StubCall", "set_in_block"]
+__all__ = ["Faults", "FaultyService", "OpenService", "StubCall", "set_in_block"]
+
+OpenService: TypeAlias = "Callable[[Service, DeliverRequest], ServicePort]"
+"""Opens a service's port."""
 
 REMATCH = 0.05
 """Seconds after which a response is sent again to a client that is not fully discovered."""

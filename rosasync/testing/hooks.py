@@ -20,13 +20,12 @@ if TYPE_CHECKING:
         Service,
         ServicePort,
     )
+    from rosasync.testing.faults import OpenService
 
-__all__ = ["GraphSession", "HookedFakeNode", "Hooks", "OpenClient", "OpenService"]
+__all__ = ["GraphSession", "HookedFakeNode", "Hooks", "OpenClient"]
 
 OpenClient: TypeAlias = "Callable[[Service, Deliver], ClientPort]"
 """Opens a client's port."""
-OpenService: TypeAlias = "Callable[[Service, DeliverRequest], ServicePort]"
-"""Opens a service's port."""
 
 
 @dataclass

@@ -15,7 +15,7 @@ from rosasync._ros.action_types import action_type
 from rosasync._ros.messages import make_message, to_dict
 from rosasync.errors import GoalAborted, GoalCanceled, GoalRejected, SessionClosed
 from rosasync.options import check_seconds
-from rosasync.testing.faults import Faults, FaultyService, StubCall, set_in_block
+from rosasync.testing.faults import Faults, FaultyService, OpenService, StubCall, set_in_block
 from rosasync.testing.matching import check_fields, count, describe, difference, matches
 from rosasync.testing.rules import Match, Rule, take_answer
 from rosasync.typing import FeedbackT, GoalT, ResultT
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from rosasync._actions.server import ActionServer
     from rosasync._actions.server_goal import ServerGoal
     from rosasync._core.ports import DeliverRequest, Service, ServicePort
-    from rosasync.testing.hooks import OpenService
 
 __all__ = ["STUB", "GoalAnswer", "StubActionServer", "StubGoal"]
 
