@@ -147,7 +147,7 @@ class Stock(Caller):
         pending[future] = began, timeout
 
         def done(answered: Any) -> None:
-            # On the executor's thread. Whoever removes the call first counts it.
+            # On the executor's thread. The first to remove the call counts it.
             if pending.pop(answered, None) is not None:
                 log.note(began, timeout, ANSWERED)
 

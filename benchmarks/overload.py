@@ -1,4 +1,4 @@
-"""More calls than a server can answer: how many are answered while somebody still waits."""
+"""More calls than a server can answer: how many are answered while their callers still wait."""
 
 from __future__ import annotations
 

@@ -888,7 +888,7 @@ class Session:
         wait: bool | float = True,
         feedback: int = 10,
     ) -> AbstractAsyncContextManager[Goal[Any, Any]]:
-        """Follow a goal that runs already, whoever has sent it. Leaving the block cancels nothing.
+        """Follow a goal that runs already, from any client. Leaving the block cancels nothing.
 
         Args:
             action_type: an action class or its name.

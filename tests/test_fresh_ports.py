@@ -68,7 +68,7 @@ def test_any_number_of_the_domain() -> None:
     ports = chosen()
     assert ports <= set(NUMBERS)
     assert len(ports) > 10
-    # Whoever chooses the same at the same time gets the next.
+    # A process that chooses the same at the same time gets the next.
     assert max(ports) + 2 <= NUMBERS[-1]
 
 

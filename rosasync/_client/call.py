@@ -205,7 +205,7 @@ class Call:
         return bool(outstanding)
 
     def end(self, now: float) -> None:
-        """Return what the call holds. Called once, by whoever is first:
+        """Return what the call holds. Called once, by the first of these:
 
         - its client, as it delivers the response: so the place is free before the caller's task
           runs, and an answered call holds nothing while that task waits for its turn;

@@ -43,9 +43,9 @@ class ServicePool:
 
     Confined to the loop's thread. Its state changes only between awaits, so there is no lock.
 
-    A caller sends at once if nobody waits and a matched client has a free place. All others wait,
-    and `Dispatch.assign` decides who of them goes next. So a caller who comes later finds the queue
-    and cannot overtake it.
+    A caller sends at once if none waits and a matched client has a free place. All others wait, and
+    `Dispatch.assign` decides which goes next. So a caller that comes later finds the queue and
+    cannot overtake it.
     """
 
     def __init__(
@@ -217,7 +217,7 @@ class ServicePool:
         copy: bool = False,
     ) -> asyncio.Task[Any]:
         """Start a call as a task, and send at once if that is possible; as `call` otherwise."""
-        # Weak, so that a task that nobody holds is collected although its call is in the queue.
+        # Weak, so that a task without other references is collected although its call is queued.
         started: weakref.ref[asyncio.Task[Any]] | None = None
 
         def is_cancelled() -> bool:

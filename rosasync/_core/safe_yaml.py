@@ -151,8 +151,8 @@ def at(event: Event) -> str:
 class _Limits:
     """Counts what the aliases of a document stand for, and the depth.
 
-    A few hundred bytes of aliases can stand for more than any memory holds. Whoever walks over the
-    value afterwards visits all of it.
+    A few hundred bytes of aliases can stand for more than any memory holds. Code that walks
+    over the value afterwards visits all of it.
     """
 
     def __init__(self, yaml: Any) -> None:

@@ -53,11 +53,11 @@ def port_prefix() -> str:
 
 
 def fresh_offset(domain: int, current: int | None = None) -> int | None:
-    """Choose the ``offsetd3`` that gives the next participant a port nobody left behind.
+    """Choose the ``offsetd3`` that gives the next participant a port that no process left behind.
 
     Prefers a number that no process has used, then one that was closed, then one whose process is
     dead for so long that no peer can write to it. Among equals it chooses at random, because other
-    processes choose at the same time: whoever comes second gets the next number.
+    processes choose at the same time: the second gets the next number.
 
     Args:
         domain: the ROS domain.

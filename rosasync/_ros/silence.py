@@ -2,8 +2,8 @@
 
 Processes discover each other by UDP. Messages between processes of one host go through ports in
 shared memory (`rosasync._ros.fresh_ports`). Another user's port cannot be written to, and without
-a common ``/dev/shm`` each process writes into ports of its own that nobody reads. Fast DDS reports
-neither.
+a common ``/dev/shm`` each process writes into ports of its own that no other reads. Fast DDS
+reports neither.
 """
 
 from __future__ import annotations

@@ -126,8 +126,8 @@ class ServiceCall(Generic[RequestT, ResponseT]):
             if self.status is not None:
                 self.status.report(Outcome.FAILED)
             warnings.warn(
-                f"{self._sender.name}: a call was dropped unanswered, so its client waits in vain: "
-                "keep the call, and call its respond() once",
+                f"{self._sender.name}: a call was dropped unanswered, so its client gets no "
+                "response: keep the call, and call its respond() once",
                 ResourceWarning,
                 source=self,
                 stacklevel=2,

@@ -24,7 +24,7 @@ class Reporter:
     """The reports of all servers of a session that take part.
 
     The publisher of the reports is what shows callers that the process takes part. The first
-    server creates it. The subscription to the departures is created when somebody listens to the
+    server creates it. The subscription to the departures is created when a caller listens to the
     reports. Confined to the loop's thread.
 
     Args:
@@ -71,7 +71,7 @@ class Reporter:
         self._on_departures.pop(server, None)
 
     def on_graph(self) -> None:
-        """Listen to departures once somebody listens to the reports; after a graph change."""
+        """Listen to departures once a caller listens to the reports; after a graph change."""
         if self._departures is None and self._process is not None and self._is_heard():
             from service_msgs.msg import ServiceEventInfo
 
@@ -80,7 +80,7 @@ class Reporter:
             )
 
     def report(self, report: Report) -> None:
-        """Publish a report, if somebody listens."""
+        """Publish a report, if a caller listens."""
         if self._reports is not None and self._is_heard():
             message = self._node.make_message(self._type, report.to_mapping())
             self._reports.publish(message)
