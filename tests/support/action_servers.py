@@ -51,7 +51,8 @@ class ActionServerProcess(Child):
         accept_delay: float = 0.0,
         cancel: bool = True,
         result_timeout: int = 900,
-        mute_results: bool = False,
+        ignored_asks: int = 0,
+        idle: bool = False,
     ) -> None:
         """Create an action server, and return when it exists.
 
@@ -66,7 +67,8 @@ class ActionServerProcess(Child):
             accept_delay: seconds before it answers to a goal.
             cancel: whether it agrees to cancel goals.
             result_timeout: seconds for which it keeps results.
-            mute_results: whether it never sends a result.
+            ignored_asks: how many requests for a result it ignores at first.
+            idle: whether a held goal takes no thread of the executor, so that hundreds may run.
         """
         arguments: dict[str, Any] = {
             "name": name,
@@ -79,7 +81,8 @@ class ActionServerProcess(Child):
             "accept_delay": accept_delay,
             "cancel": cancel,
             "result_timeout": result_timeout,
-            "mute_results": mute_results,
+            "ignored_asks": ignored_asks,
+            "idle": idle,
         }
         try:
             self.ask_now("serve", patience=LIMIT, **arguments)
@@ -140,14 +143,31 @@ class _Server:
             cancel_callback=lambda goal: self._cancel,
             result_timeout=options["result_timeout"],
         )
-        if options["mute_results"]:
-            self.server._execute_get_result_request = self._ignore
+        self._ignored = options["ignored_asks"]
+        self._answer_ask = self.server._execute_get_result_request
+        self.server._execute_get_result_request = self._take_ask
+        self._idle: list[Any] = []
+        if options["idle"]:
+            threading.Thread(target=self._watch_idle, daemon=True).start()
 
     def statuses(self) -> dict[str, int]:
         return {key: goal() for key, goal in dict(self.goals).items()}
 
-    async def _ignore(self, request: Any) -> None:
-        """Answer to no request for a result."""
+    async def _take_ask(self, request: Any) -> None:
+        if self._ignored > 0:
+            self._ignored -= 1
+        else:
+            await self._answer_ask(request)
+
+    def _watch_idle(self) -> None:
+        """Start idle goals when they are to end."""
+        while not self.released.wait(0.01):
+            for goal in tuple(self._idle):
+                if goal.is_cancel_requested:
+                    self._idle.remove(goal)
+                    goal.execute()
+        for goal in self._idle:
+            goal.execute()
 
     def _on_goal(self, goal: Any) -> Any:
         time.sleep(self.options["accept_delay"])
@@ -165,7 +185,10 @@ class _Server:
         with self.accepted:
             self.goals[bytes(goal.goal_id.uuid).hex()] = status
             self.accepted.notify_all()
-        goal.execute()
+        if self.options["idle"]:
+            self._idle.append(goal)
+        else:
+            goal.execute()
 
     def _execute(self, goal: Any) -> Any:
         options = self.options
@@ -240,7 +263,7 @@ class _Servers:
         deadline = time.monotonic() + LIMIT
         while not publisher.get_subscription_count() and time.monotonic() < deadline:
             time.sleep(0.01)
-        publisher.publish(b"\0\1\0\0" + bytes.fromhex(goal_id) + b"\xff\xff")
+        publisher.publish(b"\0\1\0\0" + bytes.fromhex(goal_id))
         publisher.publish(b"\0\1\0\0")
         self._node.destroy_publisher(publisher)
 
@@ -253,19 +276,31 @@ class _Servers:
 def main() -> None:
     import rclpy
     from rclpy.executors import MultiThreadedExecutor
+    from rclpy.impl.implementation_singleton import rclpy_implementation
     from rclpy.signals import SignalHandlerOptions
 
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node(sys.argv[1])
     executor = MultiThreadedExecutor(8)
     executor.add_node(node)
-    spinner = threading.Thread(target=executor.spin)
+    finished = threading.Event()
+
+    def spin() -> None:
+        while not finished.is_set():
+            # An action server that is destroyed by one thread may be in another's wait set.
+            with suppress(rclpy_implementation.RCLError):
+                executor.spin_once()
+
+    spinner = threading.Thread(target=spin)
     spinner.start()
     servers = _Servers(node, executor)
     serve_commands(servers.commands())
     servers.clear()
-    rclpy.shutdown()
+    finished.set()
+    executor.create_task(lambda: None)
     spinner.join()
+    executor.shutdown()
+    rclpy.shutdown()
 
 
 if __name__ == "__main__":

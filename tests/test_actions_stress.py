@@ -1,0 +1,240 @@
+"""Goals in bad times, with stock action servers: no orphan, no loss, no wait without end."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+from typing import TYPE_CHECKING
+
+import pytest
+from test_msgs.action import Fibonacci
+
+from rosasync import (
+    GoalError,
+    GoalStatus,
+    GoalTimeout,
+    RosasyncError,
+    ServerGone,
+    Session,
+)
+from rosasync._actions import client as action_client
+from tests.support.action_servers import ActionServerProcess
+from tests.support.times import LIMIT, TICK, until
+
+if TYPE_CHECKING:
+    from tests.conftest import Bridge
+
+
+class Leavers:
+    """Callers that leave their goals at random moments, in every way."""
+
+    def __init__(self, bridge: Bridge, choose: random.Random) -> None:
+        self.bridge = bridge
+        self.choose = choose
+        self.detached: set[object] = set()
+        self.sent = 0
+
+    async def run(self, goals: int) -> None:
+        """Open sessions that send goals, until there were so many."""
+        while self.sent < goals:
+            await self._run_session(min(self.choose.randint(5, 25), goals - self.sent))
+
+    async def _run_session(self, goals: int) -> None:
+        # The end of this block leaves what is still out.
+        async with Session("leaver", bridge=self.bridge, timeout=LIMIT) as session:
+            await session.wait_for_service(
+                Fibonacci.Impl.SendGoalService, "/held/_action/send_goal", timeout=LIMIT
+            )
+            tasks = [asyncio.create_task(self._leave(session)) for _ in range(goals)]
+            self.sent += goals
+            await asyncio.sleep(self.choose.uniform(0, 2 * TICK))
+            for task in self.choose.sample(tasks, goals // 2):
+                task.cancel()
+                if self.choose.random() < 0.3:
+                    await asyncio.sleep(self.choose.uniform(0, TICK / 10))
+            if self.choose.random() < 0.5:
+                await asyncio.sleep(self.choose.uniform(0, 4 * TICK))
+        for outcome in await asyncio.gather(*tasks, return_exceptions=True):
+            # Besides the errors of goals: asyncio's own, of a timeout or a group.
+            expected = RosasyncError | asyncio.CancelledError | TimeoutError | ExceptionGroup
+            if outcome is not None and not isinstance(outcome, expected):
+                raise outcome
+
+    async def _leave(self, session: Session) -> None:
+        choose = self.choose
+        await asyncio.sleep(choose.choice([0, 0, choose.uniform(0, TICK)]))
+        way = choose.choice(["act", "timeout", "block", "error", "group", "detach", "late"])
+        if way == "act":
+            await session.act(Fibonacci, "/held", {"order": 1})
+        elif way == "timeout":
+            await session.act(Fibonacci, "/held", timeout=choose.uniform(0, 2 * TICK))
+        elif way == "late":
+            await session.act(Fibonacci, "/held", accept_timeout=choose.uniform(0, TICK / 2))
+        elif way == "group":
+            async with asyncio.timeout(choose.uniform(0, 2 * TICK)), asyncio.TaskGroup() as group:
+                for _ in range(2):
+                    group.create_task(session.act(Fibonacci, "/held"))
+        else:
+            async with session.goal(Fibonacci, "/held", cancel_timeout=TICK) as goal:
+                if way == "detach":
+                    goal.detach()
+                    self.detached.add(goal.id)
+                await asyncio.sleep(choose.uniform(0, TICK))
+                if way == "error":
+                    raise GoalError("left by an error")
+
+
+async def leave_goals(server: ActionServerProcess, bridge: Bridge, goals: int, seed: int) -> None:
+    await server.serve("/held", hold=True, idle=True, accept_delay=0.001)
+    leavers = Leavers(bridge, random.Random(seed))
+    await leavers.run(goals)
+    running: set[object] = set()
+    for _ in range(40):
+        running = set(await server.running("/held"))
+        if running <= leavers.detached:
+            break
+        await asyncio.sleep(LIMIT / 80)
+    assert running <= leavers.detached, f"{len(running - leavers.detached)} of {leavers.sent}"
+    assert running, "no goal was detached"
+
+
+async def test_no_goal_is_left_behind(action_server: ActionServerProcess, bridge: Bridge) -> None:
+    await leave_goals(action_server, bridge, 200, seed=1)
+
+
+@pytest.mark.soak
+async def test_no_goal_of_two_thousand_is_left_behind(
+    action_server: ActionServerProcess, bridge: Bridge
+) -> None:
+    await leave_goals(action_server, bridge, 2000, seed=2)
+
+
+def test_the_end_of_the_loop_leaves_no_goal_behind(
+    action_server: ActionServerProcess, bridge: Bridge
+) -> None:
+    """As Ctrl-C ends ``asyncio.run``: every task is cancelled, in the middle of everything."""
+
+    async def program() -> None:
+        async with Session("interrupted", bridge=bridge, timeout=LIMIT) as session:
+            for _ in range(10):
+                asyncio.create_task(session.act(Fibonacci, "/held"))  # noqa: RUF006
+            leaver = asyncio.create_task(session.act(Fibonacci, "/held"))
+            await action_server.goals("/held", at_least=5)
+            leaver.cancel()
+            tasks[0].cancel()
+            await asyncio.sleep(LIMIT)
+
+    tasks: list[asyncio.Task[None]] = []
+
+    async def run() -> None:
+        tasks.append(asyncio.create_task(program()))
+        await tasks[0]
+
+    action_server.serve_now("/held", hold=True, idle=True)
+    with pytest.raises(asyncio.CancelledError):
+        asyncio.run(run())
+    for _ in range(40):
+        if not asyncio.run(action_server.running("/held")):
+            return
+    raise AssertionError("goals run on")
+
+
+async def receive_all(session: Session, server: ActionServerProcess, count: int) -> None:
+    await server.serve("/fast", feedback=count, rate=1000)
+    received: list[int] = []
+    await session.act(
+        Fibonacci, "/fast", on_feedback=lambda feedback: received.append(feedback.sequence[0])
+    )
+    assert received == list(range(count))
+
+
+async def test_a_quick_reader_gets_all_feedback(
+    session: Session, action_server: ActionServerProcess
+) -> None:
+    await receive_all(session, action_server, 500)
+
+
+@pytest.mark.slow
+async def test_a_quick_reader_gets_all_feedback_of_five_seconds(
+    session: Session, action_server: ActionServerProcess
+) -> None:
+    await receive_all(session, action_server, 5000)
+
+
+async def test_forged_feedback_is_dropped(
+    session: Session, action_server: ActionServerProcess, caplog: pytest.LogCaptureFixture
+) -> None:
+    await action_server.serve("/held", hold=True)
+    async with session.goal(Fibonacci, "/held") as goal:
+        await action_server.forge("/held", goal.id)
+        reader = asyncio.create_task(anext(goal))
+        await until(lambda: goal.feedback_dropped == 1)
+        assert "a feedback message is dropped" in caplog.text
+        await action_server.release("/held")
+        with pytest.raises(StopAsyncIteration):
+            await reader
+        await goal.result()
+
+
+async def test_a_lost_request_for_the_result_is_sent_again(
+    session: Session, action_server: ActionServerProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(action_client, "ENDED_ASK", 2 * TICK)
+    await action_server.serve("/forgets", ignored_asks=2)
+    result = await session.act(Fibonacci, "/forgets", {"order": 2})
+    assert list(result.sequence) == [0, 1]
+
+
+async def test_a_server_that_never_sends_a_result_is_not_waited_for_without_end(
+    session: Session, action_server: ActionServerProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(action_client, "ENDED_PATIENCE", 4 * TICK)
+    await action_server.serve("/mute", ignored_asks=1_000_000)
+    with pytest.raises(GoalTimeout, match="ended as SUCCEEDED, and the server does not send its"):
+        await session.act(Fibonacci, "/mute")
+
+
+async def test_a_killed_server_and_its_successor(bridge: Bridge) -> None:
+    async with Session("survivor", bridge=bridge, timeout=LIMIT) as session:
+        with ActionServerProcess("mortal", lease=1) as server:
+            await server.serve("/mortal", hold=True)
+            goals = [asyncio.create_task(session.act(Fibonacci, "/mortal")) for _ in range(5)]
+            await server.goals("/mortal", at_least=5)
+            server.kill()
+            for goal in goals:
+                with pytest.raises(ServerGone):
+                    await goal
+        with ActionServerProcess("successor") as server:
+            await server.serve("/mortal")
+            result = await session.act(Fibonacci, "/mortal", {"order": 1}, accept_timeout=2 * LIMIT)
+            assert list(result.sequence) == [0]
+
+
+async def test_a_replaced_server_does_not_have_the_goals(
+    session: Session, action_server: ActionServerProcess
+) -> None:
+    await action_server.serve("/held", hold=True)
+    async with session.goal(Fibonacci, "/held") as goal:
+        await action_server.stop("/held")
+        await action_server.serve("/held", hold=True)
+        with pytest.raises(ServerGone):
+            await goal.result(timeout=LIMIT)
+
+
+async def test_goals_that_run_take_no_place_in_the_window(
+    session: Session, action_server: ActionServerProcess
+) -> None:
+    await action_server.serve("/held", hold=True, idle=True)
+    tasks = [asyncio.create_task(session.act(Fibonacci, "/held")) for _ in range(30)]
+    await action_server.goals("/held", at_least=30)
+    await until(lambda: session.core.actions.out == 30)
+    await until(lambda: session.pool.statistics().in_flight == 0)
+    statistics = session.pool.statistics()
+    assert (statistics.waiting, statistics.abandoned) == (0, 0)
+    names = {key.srv_name for key in statistics.keys}
+    assert names == {"/held/_action/send_goal", "/held/_action/cancel_goal"}
+    await action_server.release("/held")
+    await asyncio.gather(*tasks)
+    assert session.core.actions.out == 0
+    statuses = (await action_server.goals("/held")).values()
+    assert set(statuses) == {GoalStatus.SUCCEEDED}
