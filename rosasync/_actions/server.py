@@ -278,8 +278,11 @@ class ActionServer(Generic[GoalT, ResultT, FeedbackT]):
         message.feedback = self._node.make_message(types.Feedback, value)
         if asyncio._get_running_loop() is self._loop:
             self._send_feedback(message)
-        else:
+            return
+        try:
             self._loop.call_soon_threadsafe(self._send_feedback, deepcopy(message))
+        except RuntimeError as error:
+            raise SessionClosed(f"{self.action_name}: the event loop is closed") from error
 
     def _send_feedback(self, message: Any) -> None:
         self._feedback_count += 1
