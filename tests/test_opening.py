@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import gc
+import os
 import signal
 import subprocess
 import sys
@@ -20,7 +21,7 @@ from rosasync import Session, SessionClosed, UsageError
 from rosasync._core.aio import call_in_thread
 from rosasync._ros import node as ros_node
 from rosasync._ros import type_supports
-from tests.support.process import ROOT
+from tests.support.process import ROOT, own
 from tests.support.times import LIMIT, TICK, until
 
 TURNS = 3
@@ -319,3 +320,55 @@ async def test_a_context_of_a_domain_that_does_not_exist(domain: int) -> None:
                 pass
     finally:
         context.try_shutdown()
+
+
+OPEN = """
+import asyncio, rosasync
+async def main():
+    try:
+        async with rosasync.Session("opened"):
+            print("opened")
+    except rosasync.RosasyncError as error:
+        print(error)
+asyncio.run(main())
+"""
+
+
+@pytest.mark.parametrize(
+    ("environ", "arguments", "expected"),
+    [
+        ({"ROS_LOG_DIR": "/proc/none"}, (), "set ROS_LOG_DIR"),
+        ({"HOME": "", "ROS_LOG_DIR": "", "ROS_HOME": ""}, (), "set ROS_LOG_DIR"),
+        (
+            {"ROS_STATIC_PEERS": "no.such.invalid", "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"},
+            (),
+            "ROS_STATIC_PEERS",
+        ),
+        (
+            {
+                "ROS_SECURITY_ENABLE": "true",
+                "ROS_SECURITY_STRATEGY": "Enforce",
+                "ROS_SECURITY_KEYSTORE": "/no/such/folder",
+            },
+            (),
+            "ROS_SECURITY_KEYSTORE",
+        ),
+        ({}, ("--ros-args", "-r", "x"), "--ros-args"),
+        ({}, ("--ros-args", "--nonsense"), "--ros-args"),
+        ({}, ("--ros-args", "\udcff"), "--ros-args"),
+        ({"LC_ALL": "xx_YY.none", "RCUTILS_LOGGING_BUFFERED_STREAM": "x"}, (), "opened"),
+    ],
+)
+def test_what_the_environment_prevents_is_an_exception(
+    environ: dict[str, str], arguments: tuple[str, ...], expected: str
+) -> None:
+    done = subprocess.run(
+        (sys.executable, "-c", OPEN, *arguments),
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, **environ},
+        cwd=ROOT,
+    )
+    assert expected in own(done.stdout)
+    assert ".c:" not in done.stdout

@@ -16,6 +16,7 @@ from rosasync.errors import ContextShutdown, RosasyncError, UsageError
 
 __all__ = [
     "RclpyError",
+    "cannot_create",
     "check_up",
     "explain",
     "is_destroyed",
@@ -30,8 +31,26 @@ RclpyError = (InvalidHandle, rclpy_implementation.RCLError)
 """What rclpy raises if an entity was destroyed, or if rcl reports an error."""
 
 
-_SOURCE = re.compile(r",? at \S+\.(?:c|cc|cpp|h|hpp):\d+(?:,\s*)?")
+_SOURCE = re.compile(r",?\s*\bat \S+\.(?:c|cc|cpp|h|hpp):\d+")
 """Where rcl has raised an error, which it appends to each message."""
+
+
+_OPENING = (
+    (r"logging directory|log directory", "set ROS_LOG_DIR to a folder that can be written"),
+    (r"resolve peer", "check the names in ROS_STATIC_PEERS"),
+    (r"SECURITY ERROR", "check ROS_SECURITY_KEYSTORE, or unset ROS_SECURITY_ENABLE"),
+    (r"create participant", "check the transports in FASTDDS_BUILTIN_TRANSPORTS and your profile"),
+    (r"Couldn't parse|Enclave|^\[|surrogates", "check what follows --ros-args on the command line"),
+)
+"""What to do about errors of rclpy that prevent a node, by what they say."""
+
+
+def cannot_create(name: str, error: Exception) -> RosasyncError:
+    """Return the error to raise if rclpy cannot create a node of this name."""
+    reason = reason_of(error)
+    found = [advice for pattern, advice in _OPENING if re.search(pattern, reason)]
+    advice = f": {found[0]}" if found else ""
+    return RosasyncError(f"rclpy cannot create the node {name!r} ({reason}){advice}")
 
 
 def reason_of(error: Exception) -> str:

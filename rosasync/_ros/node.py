@@ -40,9 +40,9 @@ from rosasync._ros.executor_bridge import ExecutorBridge
 from rosasync._ros.executor_thread import ExecutorThread, ThreadUser, executor_thread_of
 from rosasync._ros.failures import (
     RclpyError,
+    cannot_create,
     check_up,
     is_up,
-    reason_of,
     refusal,
     topic_refusal,
     uses_node,
@@ -53,7 +53,7 @@ from rosasync._ros.messages import make_message
 from rosasync._ros.shared_memory import check_ports
 from rosasync._ros.topics import Publisher, qos_profile
 from rosasync._ros.types import type_name
-from rosasync.errors import ContextShutdown, RosasyncError, UsageError
+from rosasync.errors import ContextShutdown, UsageError
 from rosasync.options import SessionOptions
 
 if TYPE_CHECKING:
@@ -355,11 +355,10 @@ class RosNode:
             raise ValueError(f"{node!r} is not a valid node name: {reason}") from None
         except UsageError:
             raise
-        except RuntimeError as error:
-            # RCLError, or what C++ throws if the process is out of file descriptors.
-            raise RosasyncError(
-                f"rclpy cannot create the node {node!r}: {reason_of(error)}"
-            ) from error
+        except (RuntimeError, UnicodeError) as error:
+            # RCLError, or what C++ throws if the process is out of file descriptors; the second for
+            # arguments of the command line.
+            raise cannot_create(node, error) from error
         return self._own_node
 
     def _make_own(self, name: str, given: Context | None) -> Node:
