@@ -17,7 +17,7 @@ _WHOLE = re.compile("[-+]?[1-9][0-9]*")
 
 
 def read_value(text: str, kind: ParameterType) -> Any:
-    """Return the value that is meant for a parameter.
+    """Read the value for a parameter.
 
     What does not fit the type is left as it is: the node refuses it, and says why.
 
@@ -48,7 +48,7 @@ def read_value(text: str, kind: ParameterType) -> Any:
 
 
 def _text(text: str) -> str:
-    """Return the text that is meant: without its quotes, and otherwise as it was written."""
+    """Return a text without its quotes, and otherwise as it was written."""
     try:
         scalar = build(text, _itself)
     except YamlError:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import difflib
 import functools
-import importlib
 import re
 from typing import Any
 
-from rosasync._ros.types import type_name
+from rosasync._ros.types import load_definitions, type_name
 
 __all__ = ["action_type"]
 
@@ -56,18 +55,11 @@ def _action_named(name: str) -> type[Any]:
             "such as 'nav2_msgs/action/NavigateToPose'"
         )
     package, wanted = match.groups()
-    try:
-        module = importlib.import_module(f"{package}.action")
-    except ModuleNotFoundError as error:
-        if error.name == package:
-            raise ValueError(
-                f"{name!r}: the package {package!r} is not installed for this Python, "
-                "or its workspace is not sourced"
-            ) from None
-        if error.name == f"{package}.action":
-            raise ValueError(f"{name!r}: the package {package!r} has no actions") from None
-        raise
-    actions: dict[str, type[Any]] = {k: v for k, v in vars(module).items() if _is_action(v)}
+    actions: dict[str, type[Any]] = {
+        key: found
+        for key, found in load_definitions(package, "action", "actions", name).items()
+        if _is_action(found)
+    }
     if wanted not in actions:
         similar = difflib.get_close_matches(wanted, actions, n=1)
         hint = f"; did you mean '{package}/action/{similar[0]}'?" if similar else ""

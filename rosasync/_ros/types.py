@@ -14,7 +14,7 @@ import reprlib
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-__all__ = ["Unquoted", "hint", "service_type", "shown", "type_name"]
+__all__ = ["Unquoted", "hint", "load_definitions", "service_type", "shown", "type_name"]
 
 
 class Unquoted(str):
@@ -83,7 +83,11 @@ def _service_named(name: str) -> type[Any]:
             "such as 'std_srvs/srv/SetBool'"
         )
     package, wanted = match.groups()
-    services = _services_of(package, name)
+    services: dict[str, type[Any]] = {
+        key: found
+        for key, found in load_definitions(package, "srv", "services", name).items()
+        if _is_service(found)
+    }
     if wanted not in services:
         similar = difflib.get_close_matches(wanted, services, n=1)
         names = hint([f"{package}/srv/{found}" for found in similar], services)
@@ -91,19 +95,29 @@ def _service_named(name: str) -> type[Any]:
     return services[wanted]
 
 
-def _services_of(package: str, name: str) -> dict[str, type[Any]]:
+def load_definitions(package: str, kind: str, noun: str, name: str) -> dict[str, Any]:
+    """Import what a package defines of one kind.
+
+    Args:
+        package: the package.
+        kind: its module, ``srv`` or ``action``.
+        noun: what the module has, for the errors.
+        name: the name of the type that is looked for, for the errors.
+
+    Raises:
+        ValueError: the package is not installed, or has none.
+    """
     try:
-        module = importlib.import_module(f"{package}.srv")
+        return vars(importlib.import_module(f"{package}.{kind}"))
     except ModuleNotFoundError as error:
         if error.name == package:
             raise ValueError(
                 f"{name!r}: the package {package!r} is not installed for this Python, "
                 "or its workspace is not sourced"
             ) from None
-        if error.name == f"{package}.srv":
-            raise ValueError(f"{name!r}: the package {package!r} has no services") from None
+        if error.name == f"{package}.{kind}":
+            raise ValueError(f"{name!r}: the package {package!r} has no {noun}") from None
         raise
-    return {key: found for key, found in vars(module).items() if _is_service(found)}
 
 
 def _is_service(candidate: object) -> bool:

@@ -1,4 +1,4 @@
-"""What the caller of a request is told of it, and whether it has left: for one call."""
+"""The reports to the caller of one call, and whether that caller has left."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from typing import Any
 from rosasync._ros.fields import field_types
 from rosasync._ros.types import type_name
 
-__all__ = ["check_fields", "count", "describe", "difference", "matches"]
+__all__ = ["check_fields", "count", "describe", "difference", "explain_mismatch", "matches"]
 
 
 def matches(expected: Any, actual: Any) -> bool:
@@ -64,6 +64,23 @@ def difference(expected: Any, actual: Any) -> str:
         n=100,
     )
     return "\n".join(lines)
+
+
+def explain_mismatch(
+    expected: Sequence[Mapping[str, Any]], requests: Sequence[Mapping[str, Any]]
+) -> str | None:
+    """Compare all requests, in order; of each, only the fields that are expected count.
+
+    Returns:
+        Their difference; None if they match.
+    """
+    if len(expected) == len(requests) and all(map(matches, expected, requests)):
+        return None
+    shown = [
+        {name: request[name] for name in fields} if fields else request
+        for fields, request in zip([*expected, *[{}] * len(requests)], requests, strict=False)
+    ]
+    return difference([dict(fields) for fields in expected], shown)
 
 
 def count(number: int, noun: str) -> str:

@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING, Any, Generic, Self, TypeAlias
 from rosasync._ros.messages import to_dict, to_message
 from rosasync._ros.types import service_type
 from rosasync.testing.faults import Faults, FaultyService, StubCall, set_in_block
-from rosasync.testing.matching import check_fields, count, describe, difference, matches
+from rosasync.testing.matching import (
+    check_fields,
+    count,
+    describe,
+    difference,
+    explain_mismatch,
+    matches,
+)
 from rosasync.testing.rules import Match, Rule
 from rosasync.typing import RequestT, ResponseT
 
@@ -254,20 +261,8 @@ class StubServer(Generic[RequestT, ResponseT]):
         __tracebackhide__ = True
         for fields in expected:
             check_fields(self._type.Request, fields)
-        requests = self.requests
-        if matches_all := len(expected) == len(requests):
-            matches_all = all(map(matches, expected, requests))
-        if not matches_all:
-            wanted = [dict(fields) for fields in expected]
-            shown = [
-                {name: request[name] for name in fields} if fields else request
-                for fields, request in zip(
-                    [*expected, *[{}] * len(requests)], requests, strict=False
-                )
-            ]
-            raise self._failure(
-                f"expected {count(len(expected), 'request')}", f"\n{difference(wanted, shown)}"
-            )
+        if (differences := explain_mismatch(expected, self.requests)) is not None:
+            raise self._failure(f"expected {count(len(expected), 'request')}", f"\n{differences}")
 
     def _failure(self, expected: str, more: str = "") -> AssertionError:
         received = describe(self.requests, self.lost_requests)

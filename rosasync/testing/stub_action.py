@@ -16,7 +16,7 @@ from rosasync._ros.messages import make_message, to_dict
 from rosasync.errors import GoalAborted, GoalCanceled, GoalRejected, SessionClosed
 from rosasync.options import check_seconds
 from rosasync.testing.faults import Faults, FaultyService, OpenService, StubCall, set_in_block
-from rosasync.testing.matching import check_fields, count, describe, difference, matches
+from rosasync.testing.matching import check_fields, count, describe, explain_mismatch
 from rosasync.testing.rules import Match, Rule, take_answer
 from rosasync.typing import FeedbackT, GoalT, ResultT
 
@@ -257,17 +257,8 @@ class StubActionServer(Generic[GoalT, ResultT, FeedbackT]):
         __tracebackhide__ = True
         for fields in expected:
             check_fields(self._type.Goal, fields)
-        requests = self.requests
-        if len(expected) == len(requests) and all(map(matches, expected, requests)):
-            return
-        wanted = [dict(fields) for fields in expected]
-        shown = [
-            {name: request[name] for name in fields} if fields else request
-            for fields, request in zip([*expected, *[{}] * len(requests)], requests, strict=False)
-        ]
-        raise self._failure(
-            f"expected {count(len(expected), 'goal')}", f"\n{difference(wanted, shown)}"
-        )
+        if (differences := explain_mismatch(expected, self.requests)) is not None:
+            raise self._failure(f"expected {count(len(expected), 'goal')}", f"\n{differences}")
 
     def assert_statuses(self, *expected: GoalStatus) -> None:
         """Check the status of every goal, in order; UNKNOWN is that of a rejected one.
