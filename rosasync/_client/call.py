@@ -41,10 +41,13 @@ class Call:
         request: the message.
         plan: decides when to send again; None if the request is sent only once.
         lease: the leased client whose place the call uses; None if it takes one of its own.
+        deadline: the loop time at which the caller gives up; None for never.
         trace: follows the call, if something listens.
         is_cancelled: returns whether the call was cancelled in a way that its future does not show
             yet: the task of `Session.start` is cancelled before its first step, or another thread
             has cancelled. Nothing may be sent then.
+        passed: the seconds until the server answers and the seconds that were left, when the call
+            was passed over because it would have been answered too late; None if it was not.
         client: the client that sends it, set when it starts.
         newest: the newest attempt that is outstanding; None before it is sent, and while there is
             no server that has had it.
@@ -58,6 +61,7 @@ class Call:
         "_timer",
         "_verifying",
         "client",
+        "deadline",
         "earlier",
         "future",
         "in_flight",
@@ -65,6 +69,7 @@ class Call:
         "lease",
         "newest",
         "owner",
+        "passed",
         "plan",
         "request",
         "started",
@@ -82,6 +87,7 @@ class Call:
         lease: Client | None = None,
         trace: CallTrace | None = None,
         is_cancelled: Callable[[], bool] | None = None,
+        deadline: float | None = None,
     ) -> None:
         self.owner = owner
         self.future = future
@@ -90,6 +96,8 @@ class Call:
         self.lease = lease
         self.trace = trace
         self.is_cancelled = is_cancelled
+        self.deadline = deadline
+        self.passed: tuple[float, float] | None = None
         self.newest: Sent | None = None
         self.earlier: tuple[Sent, ...] = ()
         self.started = False
@@ -130,12 +138,17 @@ class Call:
             client.retried[self] = None
             self._wait(self.plan.next_delay())
 
-    def send_again(self, now: float) -> None:
-        """Send the next attempt, if the plan allows it. There has to be a place for it."""
+    def send_again(self, now: float, overloaded: bool = False) -> None:
+        """Send the next attempt, if the plan allows it. There has to be a place for it.
+
+        Args:
+            now: the loop time.
+            overloaded: whether the service has callers that it cannot answer in time.
+        """
         plan, client = self.plan, self.client
         assert plan is not None
         fast, self._fast = self._fast, False
-        if plan.begin() is not Action.SEND:
+        if plan.begin(overloaded) is not Action.SEND:
             self._wait(plan.refused_delay())
             return
         if self.newest is not None:
@@ -235,7 +248,7 @@ class Call:
         # Last, because the assignment looks at the places that were given back above. This is
         # `ClientOwner.on_places`, inlined because every call comes here.
         owner = client.owner
-        if owner.queue or owner.resends or owner.leased:
+        if owner.queue or owner.passed or owner.resends or owner.leased:
             owner.schedule()
 
     def fail_send(self, error: Exception) -> None:

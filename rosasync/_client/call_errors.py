@@ -83,6 +83,15 @@ class CallErrors:
         )
         return self._make(QueueTimeout, message, elapsed)
 
+    def too_late(self, elapsed: float, needed: float, left: float) -> CallError:
+        """Return the error for a call that was not sent, because its answer would come too late."""
+        message = (
+            f"not sent within {elapsed:.3g} s: the server answers after {needed:.2g} s now, and "
+            f"{left:.2g} s were left when the call's turn came; the server is slower than its "
+            "callers"
+        )
+        return self._make(QueueTimeout, message, elapsed)
+
     def response_timeout(self, elapsed: float, plan: Plan | None) -> CallError:
         """Return the error for a request that was sent and not answered."""
         message = f"the request was sent, but not answered within {duration(elapsed)}"

@@ -29,6 +29,10 @@ class ClientOwner(Protocol):
         """The callers that wait for a place."""
 
     @property
+    def passed(self) -> Collection[object]:
+        """The callers that have too little time left for a place."""
+
+    @property
     def resends(self) -> Collection[object]:
         """The calls that wait to be sent again."""
 
@@ -158,6 +162,7 @@ class Client:
         if window.taken == window.leases:
             window.silent_since = now
         window.taken += sent.place
+        sent.out = window.taken
         window.sent[number] = sent
         window.last = number
         return sent

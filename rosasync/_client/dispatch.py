@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -26,10 +27,24 @@ if TYPE_CHECKING:
 __all__ = ["Dispatch", "LeaseWaiter", "Waiter"]
 
 
+OVERLOAD = 1.0
+"""Minimum number of seconds for which a service counts as overloaded, after a caller was passed
+over. Callers whose deadlines pass together come back together, and would fill the window again."""
+
+
 class Waiter(Protocol):
-    """A caller in the queue: a `Call` or a `LeaseWaiter`."""
+    """A caller in the queue: a `Call` or a `LeaseWaiter`.
+
+    Attributes:
+        future: done when the caller has left.
+        deadline: the loop time by which the caller needs its answer; None if that is not known.
+        passed: the seconds until the server answers, and the seconds that were left, when the
+            caller was passed over.
+    """
 
     future: asyncio.Future[Any]
+    deadline: float | None
+    passed: tuple[float, float] | None
 
     @property
     def gone(self) -> bool:
@@ -40,12 +55,17 @@ class Waiter(Protocol):
 
 
 class LeaseWaiter:
-    """A caller that waits for a lease. Its future receives the client."""
+    """A caller that waits for a lease. Its future receives the client.
 
-    __slots__ = ("future",)
+    Its calls have deadlines of their own. So it is never passed over.
+    """
+
+    __slots__ = ("deadline", "future", "passed")
 
     def __init__(self, future: asyncio.Future[Client]) -> None:
         self.future = future
+        self.deadline: float | None = None
+        self.passed: tuple[float, float] | None = None
 
     @property
     def gone(self) -> bool:
@@ -71,6 +91,10 @@ class Dispatch:
     Attributes:
         clients: the clients of the service.
         queue: the callers that wait for a place, in their order.
+        passed: the callers that were passed over, in their order: they would be answered too late,
+            unless the server becomes quicker.
+        overloaded_until: the loop time until which the service counts as overloaded, because a
+            caller was passed over. Until then no call is sent without a look at its deadline.
         resends: the calls that wait to be sent again, in the order in which that became due.
         leased: the calls that wait for their leased client: for its match, or for the place of the
             lease while an abandoned request takes it.
@@ -90,6 +114,10 @@ class Dispatch:
     ) -> None:
         self.clients = Clients(service, node, limits, watch, errors, counts, self, listener)
         self.queue: dict[Waiter, None] = {}
+        self.passed: dict[Waiter, None] = {}
+        self.overloaded_until = 0.0
+        # The latest deadline of those passed over since there were none.
+        self._latest = 0.0
         self.resends: dict[Call, None] = {}
         self.leased: dict[Call, None] = {}
         # Each caller that waits for a match, with the client to be matched: None for any client.
@@ -113,11 +141,22 @@ class Dispatch:
         for call in (*self.resends, *self.leased):
             if (call.lease or call.client).matched_generation != generation:
                 return True
-        return bool(self.queue) and self.clients.awaits_match
+        return bool(self.queue or self.passed) and self.clients.awaits_match
+
+    @property
+    def idle(self) -> bool:
+        """Whether no caller waits for a place, so that the next one may be sent at once."""
+        busy = self.queue or self.passed or self.resends
+        return not busy and self._loop.time() >= self.overloaded_until
+
+    @property
+    def waiting(self) -> int:
+        """The number of callers that wait for a place."""
+        return len(self.queue) + len(self.passed)
 
     def callers_wait(self) -> bool:
         """Return whether callers wait for a place or a match, or calls to be sent again."""
-        return bool(self.queue or self.resends or self.leased or self._match_waiters)
+        return bool(self.queue or self.passed or self.resends or self.leased or self._match_waiters)
 
     def next_resend(self, client: Client) -> Sent | None:
         """Return the newest attempt of the first call that waits to be sent again by a client."""
@@ -132,7 +171,7 @@ class Dispatch:
             PoolFull: the queue is full.
             Exception: there is no client, and none can be created.
         """
-        waiting = len(self.queue)
+        waiting = self.waiting
         self.clients.grow(waiting + 1)
         # Callers for whom there is a free place wait for a match or a turn, so they do not count.
         free = self.clients.free
@@ -169,6 +208,7 @@ class Dispatch:
     def remove(self, call: Call) -> None:
         """Remove a call wherever it waits, because its caller leaves."""
         self.queue.pop(call, None)
+        self.passed.pop(call, None)
         self.resends.pop(call, None)
         self.leased.pop(call, None)
 
@@ -188,7 +228,7 @@ class Dispatch:
 
     def on_places(self) -> None:
         """Schedule an assignment if callers wait: places may have come free."""
-        if self.queue or self.resends or self.leased:
+        if self.queue or self.passed or self.resends or self.leased:
             self.schedule()
 
     def on_matched(self) -> None:
@@ -217,28 +257,67 @@ class Dispatch:
 
         1. Calls that are sent again, because their callers came before those in the queue.
         2. Calls on a lease: they have their place, or are the next to have it.
-        3. The queue, first come, first served, while there are matched clients with free places.
+        3. The queue, while there are matched clients with free places: first come, first served,
+           among those that can still be answered in time.
         """
         if self._ended:
             return
         now = self._loop.time()
         self._wake_match_waiters()
         for call in tuple(self.resends):
-            if call.gone or self._may_send_again(call):
+            overloaded = call.newest is not None and self._is_short(call, now)
+            if call.gone or overloaded or self._may_send_again(call):
                 del self.resends[call]
                 if not call.gone:
-                    call.send_again(now)
+                    call.send_again(now, overloaded)
         for call in tuple(self.leased):
             self._assign_lease(call, now)
+        while self.queue or self.passed:
+            client = self.clients.choose()
+            waiter = None if client is None else self._next_waiter(client, now)
+            if client is None or waiter is None:
+                break
+            waiter.start(client, now)
+        self._replace_clients()
+
+    def _next_waiter(self, client: Client, now: float) -> Waiter | None:
+        """Take the first caller who can be answered in time, and pass over those before.
+
+        A call that is passed over is not ended: it costs nothing, and the server may become quick
+        again before its deadline.
+        """
+        needed = client.window.expected(now)
+        if self.passed and self._latest - now >= needed:
+            for waiter in tuple(self.passed):
+                if waiter.gone or waiter.deadline is None or waiter.deadline - now >= needed:
+                    del self.passed[waiter]
+                    if not waiter.gone:
+                        return waiter
         while self.queue:
             waiter = next(iter(self.queue))
-            client = None if waiter.gone else self.clients.choose()
-            if client is None and not waiter.gone:
-                break
             del self.queue[waiter]
-            if client is not None:
-                waiter.start(client, now)
-        self._replace_clients()
+            if waiter.gone:
+                continue
+            if waiter.deadline is None or waiter.deadline - now >= needed:
+                return waiter
+            waiter.passed = (needed, waiter.deadline - now)
+            self.overloaded_until = now + max(OVERLOAD, needed)
+            self._latest = max(self._latest, waiter.deadline) if self.passed else waiter.deadline
+            self.passed[waiter] = None
+        if not self.passed or not client.window.idle:
+            return None
+        # Nothing else is out, so one that has hardly time enough finds out how quick the server is.
+        waiter = max(self.passed, key=_deadline_of)
+        del self.passed[waiter]
+        return None if waiter.gone else waiter
+
+    def _is_short(self, call: Call, now: float) -> bool:
+        """Return whether sending a call again would cost others their answers, or come too late."""
+        if now < self.overloaded_until:
+            return True
+        return call.deadline is not None and (
+            call.deadline - now < call.client.window.expected(now)
+        )
 
     def _run(self) -> None:
         self._scheduled = False
@@ -295,14 +374,19 @@ class Dispatch:
         If that fails, all waiting callers get the error.
         """
         try:
-            self.clients.grow(len(self.queue) or bool(self._match_waiters))
+            self.clients.grow(self.waiting or bool(self._match_waiters))
         except Exception as error:
             failure = error
             self._fail_waiting(lambda: failure)
 
     def _fail_waiting(self, error: Callable[[], Exception]) -> None:
-        waiting = [waiter.future for waiter in self.queue]
+        waiting = [waiter.future for waiter in (*self.queue, *self.passed)]
         waiting += [call.future for call in self.leased]
         for future in (*waiting, *self._match_waiters):
             if not future.done():
                 future.set_exception(error())
+
+
+def _deadline_of(waiter: Waiter) -> float:
+    """Return the deadline of a caller that was passed over."""
+    return -math.inf if waiter.gone or waiter.deadline is None else waiter.deadline

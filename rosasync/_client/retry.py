@@ -83,9 +83,19 @@ class Plan:
     Attributes:
         sent: how many attempts were sent to the present servers; 0 if all have vanished.
         over_budget: whether the budget was used up when the request was to be sent again.
+        overloaded: whether the service was overloaded then.
     """
 
-    __slots__ = ("_budget", "_delay", "_dice", "_later_answers", "_retry", "over_budget", "sent")
+    __slots__ = (
+        "_budget",
+        "_delay",
+        "_dice",
+        "_later_answers",
+        "_retry",
+        "over_budget",
+        "overloaded",
+        "sent",
+    )
 
     def __init__(
         self, retry: Retry, budget: RetryBudget, dice: Callable[[], float] | None = None
@@ -99,15 +109,25 @@ class Plan:
         self._later_answers = 0
         self.sent = 0
         self.over_budget = False
+        self.overloaded = False
 
     @property
     def verify(self) -> Callable[[], Awaitable[Any]] | None:
         """Finds out, before the request is sent again, whether it has run."""
         return self._retry.verify
 
-    def begin(self) -> Action:
-        """Return SEND if an attempt may be sent now, and WAIT if not."""
+    def begin(self, overloaded: bool = False) -> Action:
+        """Return SEND if an attempt may be sent now, and WAIT if not.
+
+        Args:
+            overloaded: whether the service has callers that it cannot answer in time. Sending
+                again would add to that.
+        """
         if self.sent >= self._retry.attempts:
+            return Action.WAIT
+        if self.sent and overloaded:
+            self.overloaded = True
+            self._later_answers = 0
             return Action.WAIT
         # Servers that have not been asked yet cannot be buried.
         if self.sent and not self._budget.take(self._retry.budget):
@@ -168,6 +188,8 @@ class Plan:
         clause = f"; sent {self.sent} times" if self.sent > 1 else ""
         if self.over_budget:
             clause += "; not sent again, because Retry.budget is used up for this service"
+        if self.overloaded:
+            clause += "; not sent again, because the server is slower than its callers"
         return clause
 
     def _spread(self, delay: float) -> float:

@@ -44,7 +44,7 @@ class Caller(Protocol):
 class Sent:
     """One attempt of a call, from its send until its response arrives or is no longer expected.
 
-    Its window changes ``place``, ``leased`` and ``lost``, and nothing else does.
+    Its window changes ``place``, ``leased``, ``out`` and ``lost``; `Client.send` sets ``out`` too.
 
     Attributes:
         number: its sequence number.
@@ -54,11 +54,12 @@ class Sent:
         leased: whether it uses the place of its call's lease. The lease holds that place whether
             or not a request is outstanding, so such a request takes none of its own.
         place: whether it takes a place of its own in the window.
+        out: how many places were taken when it was sent, with its own.
         lost: whether it is presumed lost because no answer came at all, so that the next attempt
             of its call may be sent in its place.
     """
 
-    __slots__ = ("at", "call", "leased", "lost", "number", "place", "servers")
+    __slots__ = ("at", "call", "leased", "lost", "number", "out", "place", "servers")
 
     def __init__(
         self, number: int, servers: Servers, at: float, call: Caller | None, leased: bool = False
@@ -69,6 +70,7 @@ class Sent:
         self.call = call
         self.leased = leased
         self.place = not leased
+        self.out = 1
         self.lost = False
 
     def __repr__(self) -> str:

@@ -87,7 +87,7 @@ class ServicePool:
     def __repr__(self) -> str:
         return (
             f"<ServicePool {self.service.key.srv_name} {len(self._clients)} clients, "
-            f"{self._counts.in_flight} in flight, {len(self._dispatch.queue)} waiting>"
+            f"{self._counts.in_flight} in flight, {self._dispatch.waiting} waiting>"
         )
 
     @property
@@ -114,7 +114,7 @@ class ServicePool:
         return KeyStatistics(
             clients=len(self._clients),
             idle=sum(client.is_idle for client in self._clients),
-            waiting=len(self._dispatch.queue),
+            waiting=self._dispatch.waiting,
             abandoned=self._clients.abandoned,
             window=sum(client.window.size for client in self._clients),
             share=self._clients.share,
@@ -159,7 +159,9 @@ class ServicePool:
         started = loop.time()
         deadline = None if timeout is None else started + timeout
         plan = None if retry is None else Plan(retry, self._budget)
-        call = Call(dispatch, loop.create_future(), request, plan, lease, trace, is_cancelled)
+        call = Call(
+            dispatch, loop.create_future(), request, plan, lease, trace, is_cancelled, deadline
+        )
         entry = server_timer = None
         try:
             if timeout is not None and timeout <= 0:
@@ -169,8 +171,15 @@ class ServicePool:
                 self.check_open()
                 dispatch.start_leased(call, started)
             else:
-                idle = not (dispatch.queue or dispatch.resends)
-                client = self._clients.choose() if idle else None
+                # `Dispatch.idle`, inlined.
+                client = None
+                if not (
+                    dispatch.queue
+                    or dispatch.passed
+                    or dispatch.resends
+                    or started < dispatch.overloaded_until
+                ):
+                    client = self._clients.choose()
                 if copy and (client is None or retry is not None):
                     call.request = deepcopy(request)
                 if client is not None:
@@ -242,8 +251,7 @@ class ServicePool:
         if timeout is not None and timeout <= 0:
             raise self._errors.no_time_left()
         dispatch = self._dispatch
-        idle = not (dispatch.queue or dispatch.resends)
-        client = self._clients.choose() if idle else None
+        client = self._clients.choose() if dispatch.idle else None
         if client is not None:
             client.window.lease()
             return client
@@ -369,13 +377,15 @@ class ServicePool:
 
     # Failures.
 
-    def _unreached(self, started: float) -> Exception:
+    def _unreached(self, started: float, passed: tuple[float, float] | None = None) -> Exception:
         """Make the error for a deadline that passed before the request was sent."""
         if self._ending is not None:
             return self._ending()
         elapsed = self._loop.time() - started
         if not self._clients.any_ready():
             return self._errors.unavailable(elapsed)
+        if passed is not None:
+            return self._errors.too_late(elapsed, *passed)
         return self._errors.queue_timeout(elapsed, self._counts.in_flight, self._clients.abandoned)
 
     def _count_failure(self, call: Call, error: BaseException, started: float) -> BaseException:
@@ -410,7 +420,7 @@ class ServicePool:
             case NoServer():
                 return self._errors.unavailable(elapsed)
             case Expired() if not call.started:
-                return self._unreached(started)
+                return self._unreached(started, call.passed)
             case Expired():
                 return self._errors.response_timeout(elapsed, call.plan)
             case AllServersGone():

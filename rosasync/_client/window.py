@@ -14,6 +14,14 @@ if TYPE_CHECKING:
 
 __all__ = ["Window"]
 
+RECENT = 40
+"""The number of response times from which the next one is estimated."""
+FEW = 3
+"""Fewer response times than these say nothing."""
+STALE = 10.0
+"""Seconds after which a response time says nothing any more, beyond its own length."""
+WORK_WEIGHT = 1 / 8
+"""Weight of the time for which the server has worked on the last request alone."""
 TIMED = 16
 """The first requests are timed, and then one of this many."""
 
@@ -61,9 +69,12 @@ class Window:
 
     __slots__ = (
         "_grace",
+        "_last_answer",
         "_leaving",
         "_outdated",
         "_outdated_since",
+        "_recent",
+        "_work",
         "abandoned",
         "answered",
         "last",
@@ -87,6 +98,13 @@ class Window:
         self.servers: Servers = frozenset()
         self.times = ResponseTimes()
         self._grace = grace
+        # The last response times: when each was measured, how long it was, and how many places were
+        # taken when its request was sent.
+        self._recent: deque[tuple[float, float, int]] = deque(maxlen=RECENT)
+        # For how long the server works on one request, on average: from its send or the answer
+        # before, whichever is later, to its answer.
+        self._work = 0.0
+        self._last_answer = 0.0
         # The requests without a caller, each with the time until which it is remembered. Requests
         # that have been answered in the meantime are dropped when they come to the front.
         self._leaving: deque[tuple[float, Sent]] = deque()
@@ -107,6 +125,11 @@ class Window:
         """How many places are free; negative if more are taken than there are."""
         return self.size - self.taken
 
+    @property
+    def idle(self) -> bool:
+        """Whether no request takes a place of its own."""
+        return self.taken == self.leases
+
     def lease(self) -> None:
         """Take a place for a lease."""
         self.leases += 1
@@ -122,6 +145,7 @@ class Window:
         if self.taken == self.leases:
             self.silent_since = sent.at
         self.taken += sent.place
+        sent.out = self.taken
         self.sent[sent.number] = sent
         self.last = sent.number
 
@@ -193,8 +217,13 @@ class Window:
         if number > self.answered:
             self.answered = number
         self.silent_since = now
+        seconds = now - sent.at
+        work = now - max(sent.at, self._last_answer)
+        self._work += (work - self._work) * (WORK_WEIGHT if self._recent else 1.0)
+        self._last_answer = now
+        self._recent.append((now, seconds, sent.out))
         if number <= TIMED or not number % TIMED:
-            self.times.add(now - sent.at)
+            self.times.add(seconds)
         if number in self._outdated:
             self._outdated_since = now
         if self.abandoned or self._outdated:
@@ -217,6 +246,9 @@ class Window:
         """
         came = servers - self.servers
         self.servers = servers
+        if came:
+            # The new server may be quicker.
+            self._recent.clear()
         for sent in self.sent.values():
             if not sent.servers:
                 sent.servers = servers
@@ -235,6 +267,26 @@ class Window:
         return [
             sent for sent in self.sent.values() if sent.servers and sent.servers.isdisjoint(servers)
         ]
+
+    def expected(self, now: float) -> float:
+        """Return the seconds until a request that is sent now is answered, at most; 0 if unknown.
+
+        This is the second longest of the recent response times, so that one in twenty takes longer.
+        Each is reduced to the places that are taken now: if a server works on one request after
+        another, the time grows with the number of requests ahead. For the same reason, it is at
+        least the time that the server works on one, for each that is out: so it is known how long
+        a full window takes before the first request that has met one is answered.
+        """
+        out = self.taken + 1
+        times = sorted(
+            seconds * min(1.0, out / then)
+            for measured, seconds, then in self._recent
+            if now - measured <= STALE + seconds
+        )
+        if len(times) < FEW:
+            return 0.0
+        # And one more, for what the server may get from others in the meantime.
+        return max(times[-2], out * self._work) + self._work
 
     def due(self, callers_wait: bool, resend: Sent | None) -> float:
         """Return the time at which `on_time` has something to do; infinite if it never has.

@@ -29,6 +29,7 @@ class ClientUnderTest:
         self.node = FakeNode(FakeGraph())
         self.counts = Counts()
         self.queue: list[object] = []
+        self.passed: list[object] = []
         self.resends: list[Call] = []
         self.leased: list[object] = []
         self.reported = 0

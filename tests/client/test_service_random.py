@@ -97,13 +97,15 @@ class Run:
 
     def start(self, number: int) -> asyncio.Task[Any]:
         wait = self.choose.random() < 0.8
-        if wait:
+        timeout = self.seconds()
+        # Others are passed over if they would be answered too late.
+        if wait and timeout is None:
             self.in_line.add(number)
         return self.session.start(
             Echo,
             "/echo",
             Echo.Request(number),
-            timeout=self.seconds(),
+            timeout=timeout,
             wait=wait,
             retry=self.retry(0.3),
         )

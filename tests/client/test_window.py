@@ -10,7 +10,7 @@ import pytest
 
 from rosasync._client.response_times import PATIENCE_INITIAL, PATIENCE_MIN, ResponseTimes
 from rosasync._client.sent import Sent
-from rosasync._client.window import Window
+from rosasync._client.window import RECENT, STALE, Window
 
 GRACE = 100.0
 
@@ -442,3 +442,63 @@ class TestPatience:
             times.add(0.001)
         times.add(1.0)
         assert times.patience < 0.5
+
+
+class TestExpected:
+    """How long a request takes that is sent now."""
+
+    def test_nothing_is_known_at_first(self) -> None:
+        bench = Bench(size=10)
+        assert bench.window.expected(0.0) == 0.0
+        self.serve(bench, [0.1] * 2, at_once=1)
+        assert bench.window.expected(bench.now) == 0.0
+
+    def test_one_after_another(self) -> None:
+        bench = Bench(size=10)
+        self.serve(bench, [0.1] * 10, at_once=10)
+        # A further place is counted for what others send in the meantime.
+        for out in range(9):
+            assert bench.window.expected(bench.now) == pytest.approx(0.1 * (out + 2))
+            bench.send()
+
+    def test_it_is_known_before_a_request_has_met_a_full_window(self) -> None:
+        bench = Bench(size=10)
+        bench.send(10)
+        for number in (1, 2, 3):
+            bench.now += 0.1
+            bench.answer(number)
+        assert bench.window.expected(bench.now) == pytest.approx(0.9)
+
+    def test_all_at_once(self) -> None:
+        bench = Bench(size=10)
+        for _ in range(8):
+            bench.send(10)
+            bench.now += 0.1
+            bench.answer(*range(bench.window.last - 9, bench.window.last + 1))
+        bench.send(9)
+        assert 0.1 <= bench.window.expected(bench.now) <= 0.15
+
+    def test_it_follows_a_server_that_becomes_quick_again(self) -> None:
+        bench = Bench(size=10)
+        self.serve(bench, [1.0] * 20, at_once=10)
+        self.serve(bench, [0.01] * RECENT, at_once=1)
+        assert bench.window.expected(bench.now) < 0.05
+
+    def test_it_is_forgotten_with_the_server_and_after_some_time(self) -> None:
+        bench = Bench(size=10)
+        self.serve(bench, [0.1] * 10, at_once=1)
+        assert bench.window.expected(bench.now) > 0
+        assert bench.window.expected(bench.now + STALE + 1.0) == 0.0
+        bench.see("B")
+        assert bench.window.expected(bench.now) == 0.0
+
+    @staticmethod
+    def serve(bench: Bench, seconds: list[float], at_once: int) -> None:
+        """Answer requests one after another, with a number of them out at once."""
+        bench.send(at_once)
+        first = bench.window.last - at_once + 1
+        for number, work in enumerate(seconds, first):
+            bench.now += work
+            bench.answer(number)
+            if number + at_once < first + len(seconds):
+                bench.send()
