@@ -31,6 +31,8 @@ except ImportError as error:
         f"({error}): pip install 'rosasync[opentelemetry]'"
     ) from error
 
+from rosasync.errors import HandlerFailed
+
 if TYPE_CHECKING:
     from rosasync.session import Session
     from rosasync.statistics import KeyStatistics, ServiceKey
@@ -57,7 +59,8 @@ class OpenTelemetryTrace:
     below it. Phases are events of the span. Spans and durations have the attributes
     ``rpc.system.name`` (``"ros2"``), ``rpc.method`` (the service type, ``"std_srvs/srv/SetBool"``)
     and ``ros.service.name`` (the service name). After a failure they also have ``error.type``: the
-    class of the exception, or without one ``"dropped"`` or ``"undeliverable"``.
+    class of the exception, or without one ``"dropped"`` or ``"undeliverable"``. For `HandlerFailed`
+    it is the class of the exception that the server has reported.
 
     One object may serve several sessions, also in several threads.
 
@@ -225,6 +228,8 @@ def _attributes(srv_name: str, srv_type: str) -> dict[str, str]:
 def _error_type(end: CallEnd) -> str:
     if end.error is None:
         return end.outcome
+    if isinstance(end.error, HandlerFailed) and end.error.error_type:
+        return end.error.error_type
     kind = type(end.error)
     builtin = kind.__module__ == "builtins"
     return kind.__qualname__ if builtin else f"{kind.__module__}.{kind.__qualname__}"

@@ -87,6 +87,20 @@ def test_serve_with_a_handler(function: str, tmp_path: Path) -> None:
         assert server.end() == 130
 
 
+def test_serve_reports_what_a_handler_raises(tmp_path: Path) -> None:
+    (tmp_path / "failing.py").write_text("def fail(call):\n    raise LookupError('no lamp')\n")
+    path = {"PYTHONPATH": f"{Path.cwd()}:{tmp_path}"}
+    options = ("--handler", "failing:fail", "--status")
+    with terminal("serve", "/stub/told", LAMP_TYPE, *options, **path) as server:
+        server.wait_for("Ctrl-C ends it")
+        done = rosasync("call", "/stub/told", LAMP_TYPE, "--timeout", "60")
+        server.interrupt()
+        assert server.end() == 130
+    assert (done.returncode, done.stdout) == (1, "")
+    assert "the handler failed: LookupError: no lamp. The server's log" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
 @pytest.mark.parametrize(
     ("options", "says"),
     [

@@ -17,7 +17,7 @@ from opentelemetry.sdk.trace.export import SimpleSpanProcessor
 from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
 from opentelemetry.trace import SpanKind, StatusCode
 
-from rosasync import ResponseTimeout, Retry, Session, UsageError
+from rosasync import HandlerFailed, ResponseTimeout, Retry, Session, UsageError
 from rosasync.opentelemetry import BUCKETS, OpenTelemetryTrace
 from tests.support.echo import ECHO
 from tests.support.process import ROOT
@@ -185,6 +185,31 @@ class TestSpans:
         assert span.attributes == attributes("/served", error_type="ValueError")
         assert (span.status.status_code, span.status.description) == (StatusCode.ERROR, "no")
         await discard(task)
+
+    async def test_the_type_that_the_server_reports(
+        self, fake_graph: FakeGraph, telemetry: Telemetry
+    ) -> None:
+        def handler(call: AnyCall) -> Any:
+            raise LookupError("no")
+
+        async with (
+            fake_graph.session() as other,
+            fake_graph.session(trace=telemetry.trace) as session,
+        ):
+            other.serve(ECHO, "/served", handler, status=True)
+            await session.wait_for_service(ECHO, "/served")
+            pool = session.pool.service(ECHO, "/served", None)
+            node, listener = session.core.node, session.core.pool.listener
+
+            def heard() -> bool:
+                pool.match()
+                return listener.hears(node.find_servers(pool.service))
+
+            await until(heard)
+            with pytest.raises(HandlerFailed):
+                await ask(session, "/served", "x", timeout=LIMIT)
+        (span,) = telemetry.spans(SpanKind.CLIENT)
+        assert span.attributes == attributes("/served", error_type="LookupError")
 
     async def test_a_request_that_nothing_answers(
         self, observed: Session, telemetry: Telemetry

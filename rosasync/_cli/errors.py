@@ -42,6 +42,8 @@ _ADVICE: tuple[tuple[type[Exception], str], ...] = (
     (rosasync.ServiceUnavailable, "Try: rosasync why {name}"),
     (rosasync.ResponseTimeout, "The server may still run it. Try a longer --timeout"),
     (rosasync.ServerGone, "The server may have run it. Call again when it is back"),
+    (rosasync.ServerOverloaded, "It did not run. Call again later, or less often"),
+    (rosasync.HandlerFailed, "The server's log has the traceback"),
     (rosasync.QueueTimeout, "Nothing was sent. Try a lower --concurrency or --rate"),
     (rosasync.InvalidServiceName, "Try: rosasync list"),
 )

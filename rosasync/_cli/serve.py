@@ -25,6 +25,7 @@ from rosasync._cli.requests import message_from
 from rosasync._cli.run import open_session, run
 from rosasync._cli.streams import OutputError
 from rosasync._ros.fields import field_types
+from rosasync._status.wire import Outcome
 
 __all__ = ["load_handler", "serve"]
 
@@ -59,6 +60,10 @@ def serve(
             show_default=False,
         ),
     ] = None,
+    status: Annotated[
+        bool,
+        typer.Option("--status", help="Report failures to rosasync callers, as status=True does."),
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Serve a service until Ctrl-C, and print what it is asked.
@@ -69,7 +74,7 @@ def serve(
       $ rosasync serve /door/lock std_srvs/srv/SetBool --echo --fail-rate 0.5 --drop-rate 0.1 --json
     """
     behaviour = _Behaviour(response, delay, fail_rate, drop_rate, echo)
-    run(_serve(name, srv_type, behaviour, handler, as_json))
+    run(_serve(name, srv_type, behaviour, handler, status, as_json))
 
 
 @dataclass(frozen=True)
@@ -84,7 +89,12 @@ class _Behaviour:
 
 
 async def _serve(
-    name: str, srv_type: str, behaviour: _Behaviour, handler: str | None, as_json: bool
+    name: str,
+    srv_type: str,
+    behaviour: _Behaviour,
+    handler: str | None,
+    status: bool,
+    as_json: bool,
 ) -> None:
     found = srv_class(srv_type)
     if handler is None:
@@ -95,7 +105,7 @@ async def _serve(
         raise CliError("--handler answers itself: leave out the options of the stub")
     failure: asyncio.Future[None] = asyncio.get_running_loop().create_future()
     async with open_session(introspection="contents") as session:
-        server = _start(session, found, name, _printing(answer, as_json, failure))
+        server = _start(session, found, name, _printing(answer, as_json, failure), status)
         note(f"serving {name} [{srv_type}]; Ctrl-C ends it")
         try:
             await failure
@@ -106,10 +116,14 @@ async def _serve(
 
 
 def _start(
-    session: rosasync.Session, srv_class: Any, name: str, handler: Callable[..., Any]
+    session: rosasync.Session,
+    srv_class: Any,
+    name: str,
+    handler: Callable[..., Any],
+    status: bool,
 ) -> rosasync.ServiceServer[Any, Any]:
     try:
-        return session.serve(srv_class, name, handler)
+        return session.serve(srv_class, name, handler, status=status)
     except TypeError as error:
         raise CliError(f"--handler: {error}") from None
 
@@ -173,7 +187,7 @@ class _Stub:
         try:
             await asyncio.sleep(self._behaviour.delay)
         except asyncio.CancelledError:
-            call.give_up("dropped: the server ended")
+            call.give_up("dropped: the server ended", Outcome.CLOSED)
             return None
         if random.random() < self._behaviour.drop_rate:
             call.give_up("dropped: --drop-rate")
