@@ -90,7 +90,8 @@ class Reader:
             words, _, remark = command.partition("  # ")
             program = words.removeprefix("python ")
             if not program.endswith(".py"):
-                printed = shell(words, self.folder)
+                with in_environment(self.environment):
+                    printed = shell(words, self.folder)
                 assert matches(printed, expected), f"{command} printed:\n{printed}"
                 continue
             self.run_programs.add(program)
@@ -99,7 +100,8 @@ class Reader:
             elif "second terminal" in remark:
                 path = self.folder / program
                 server = until_terminated(path, expected) if expected else running(path)
-                self.background.enter_context(server)
+                with in_environment(self.environment):
+                    self.background.enter_context(server)
             else:
                 printed = run(self.folder / program, self.environment)
                 if order := re.search(r"lines (\d+) to (\d+) in any order", remark):
@@ -107,6 +109,15 @@ class Reader:
                     printed = with_sorted(printed, part)
                     expected = with_sorted(expected, part)
                 assert matches(printed, expected), f"{command} printed:\n{printed}"
+
+
+@contextmanager
+def in_environment(variables: Mapping[str, str]) -> Iterator[None]:
+    """Start processes of a page where its shared server is, if it has one."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in variables.items():
+            patch.setenv(name, value)
+        yield
 
 
 class Servers:

@@ -75,6 +75,7 @@ def known(session: rosasync.Session) -> dict[str, Any]:
         **{module.__name__: module for module in (anyio, asyncio, logging, rosasync)},
         **{named.__name__: named for named in (LifecycleClient, ParameterClient, Path)},
         "Drive": Fibonacci,
+        "Fibonacci": Fibonacci,
         "Move": SetBool,
         "SetBool": SetBool,
         "Trigger": Trigger,
@@ -96,6 +97,9 @@ async def graph(monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Graph]:
             graph.stub(SetBool, name, {"success": True})
         for name in ("/gripper/open", "/map/rebuild"):
             graph.stub(Trigger, name, {"success": True})
+        graph.stub_action(
+            Fibonacci, "/fibonacci", {"sequence": [0, 1]}, feedback=[{"sequence": [0]}]
+        )
         monkeypatch.setattr(rosasync, "Session", graph.session)
         yield graph
 
