@@ -7,47 +7,28 @@ it is told: so hypothesis decides the order of everything, and can shorten a fai
 from __future__ import annotations
 
 import asyncio
-import selectors
+from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, settings
+from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 from hypothesis.stateful import run_state_machine_as_test as run_machine
 
 from rosasync import Limits, Retry, RosasyncError
+from rosasync._client.client import Client
 from rosasync._client.service import ServicePool
 from rosasync.testing import FakeGraph, FakeServer
+from tests.support.overload import VirtualLoop
 from tests.support.places import check_places
 from tests.support.plain import Echo, echo
 
 MOST = 100.0
 """Virtual seconds after which nothing can be left: more than all deadlines and grace periods."""
-
-
-class VirtualSelector(selectors.DefaultSelector):
-    """Waits for nothing: where a loop would sleep, its clock moves instead."""
-
-    now = 0.0
-
-    def select(self, timeout: float | None = None) -> Any:
-        ready = super().select(0)
-        if not ready and timeout:
-            self.now += timeout
-        return ready
-
-
-class VirtualLoop(asyncio.SelectorEventLoop):
-    """A loop in virtual time."""
-
-    def __init__(self) -> None:
-        self.clock = VirtualSelector()
-        super().__init__(self.clock)
-
-    def time(self) -> float:
-        return self.clock.now
+ATTEMPTS = 3
+"""How often a server may get the request of a call that is sent again."""
 
 
 class ManualServer(FakeServer):
@@ -56,9 +37,11 @@ class ManualServer(FakeServer):
     def __init__(self, graph: FakeGraph, on_request: Callable[[int], None]) -> None:
         super().__init__(graph, Echo, "/echo", echo)
         self._on_request = on_request
+        self.requests: Counter[int] = Counter()
 
     def receive(self, client: Any, number: int, request: Any) -> None:
         self._on_request(request.value)
+        self.requests[request.value] += 1
         self.received.append((client, number, request))
 
     def answer(self, place: int) -> None:
@@ -81,6 +64,9 @@ class Races(RuleBasedStateMachine):
         self.loop.set_exception_handler(lambda _, context: self.reported.append(context))
         self.graph = FakeGraph()
         self.servers: list[ManualServer] = []
+        # Those that have left as well.
+        self.all_servers: list[ManualServer] = []
+        self.once: set[int] = set()
         self.tasks: dict[int, asyncio.Task[Any]] = {}
         self.in_line: set[int] = set()
         self.sent: dict[int, None] = {}
@@ -105,8 +91,10 @@ class Races(RuleBasedStateMachine):
     @rule(timeout=SECONDS, wait=st.booleans(), retry=st.booleans(), lease=st.booleans())
     def call(self, timeout: float | None, wait: bool, retry: bool, lease: bool) -> None:
         number, self.made = self.made, self.made + 1
-        again = Retry(3, 1.0, 1.0) if retry else None
+        again = Retry(ATTEMPTS, 1.0, 1.0) if retry else None
         self.leases += lease
+        if not retry:
+            self.once.add(number)
         if lease:
             work = self._leased(number, timeout, again)
         else:
@@ -146,16 +134,22 @@ class Races(RuleBasedStateMachine):
     def pass_time(self, seconds: float) -> None:
         self._run(asyncio.sleep(seconds))
 
-    @precondition(lambda self: len(self.servers) < 2)
+    @rule()
+    def change_elsewhere(self) -> None:
+        """Change the graph, but none of these servers."""
+        self._run(self._do(self.graph.changed))
+
+    @precondition(lambda self: len(self.servers) < 3)
     @rule()
     def come(self) -> None:
         server = ManualServer(self.graph, self._sent)
         self.servers.append(server)
+        self.all_servers.append(server)
         self.graph.servers.append(server)
         self._run(self._do(self.graph.changed))
 
     @precondition(lambda self: self.servers)
-    @rule(which=st.integers(0, 1))
+    @rule(which=st.integers(0, 2))
     def leave(self, which: int) -> None:
         server = self.servers.pop(which % len(self.servers))
         self.graph.servers.remove(server)
@@ -173,6 +167,12 @@ class Races(RuleBasedStateMachine):
         statistics = self.service.statistics()
         assert statistics.in_flight >= 0
         assert statistics.abandoned >= 0
+
+    @invariant()
+    def no_server_gets_a_request_too_often(self) -> None:
+        for server in self.all_servers:
+            for number, times in server.requests.items():
+                assert times <= (1 if number in self.once else ATTEMPTS)
 
     @invariant()
     def first_come_first_served(self) -> None:
@@ -224,16 +224,38 @@ class NarrowRaces(Races):
     limits = Limits(clients=1, in_flight=1, grace=0.0)
 
 
+def _settings(examples: int) -> settings:
+    return settings(
+        max_examples=examples,
+        stateful_step_count=60,
+        deadline=None,
+        derandomize=True,
+        database=None,
+        suppress_health_check=list(HealthCheck),
+    )
+
+
 @pytest.mark.parametrize("machine", [Races, ExclusiveRaces, NarrowRaces])
 def test_in_any_order(machine: type[Races], full: bool) -> None:
     run_machine(
         machine,
-        settings=settings(
-            max_examples=1_000 if full else 40,
-            stateful_step_count=60,
-            deadline=None,
-            derandomize=not full,
-            database=None,
-            suppress_health_check=list(HealthCheck),
-        ),
+        settings=settings(_settings(1_000 if full else 40), derandomize=not full),
     )
+
+
+def test_the_model_finds_a_successor_that_is_asked_again_with_each_change(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As it once was: the request kept the servers of its first attempt when it was sent again."""
+    send = Client.send
+    first: dict[Any, Any] = {}
+
+    def send_with_stale_servers(client: Client, call: Any, now: float) -> Any:
+        sent = send(client, call, now)
+        sent.servers = first.setdefault(call, sent.servers)
+        return sent
+
+    monkeypatch.setattr(Client, "send", send_with_stale_servers)
+    with pytest.raises(AssertionError) as failed:
+        run_machine(Races, settings=settings(_settings(1_000), phases=[Phase.generate]))
+    assert failed.traceback[-1].name == "no_server_gets_a_request_too_often"
