@@ -348,9 +348,13 @@ async def test_clients_and_servers_of_a_node_are_of_one_process(world: World) ->
     port.close()
 
 
-async def test_publishers_are_counted(world: World) -> None:
-    assert world.node.count_publishers("/port_topic") == 0
+async def test_publishers_are_identified(world: World) -> None:
+    client = world.client()
+    assert world.node.find_publishers("/port_topic") == frozenset()
     publisher = world.node.open_publisher(GoalStatusArray, "/port_topic", TopicQos())
-    await until(lambda: world.node.count_publishers("/port_topic") == 1)
+    await until(lambda: world.node.find_publishers("/port_topic"))
+    (found,) = world.node.find_publishers("/port_topic")
+    assert process_of(found) == process_of(client.identity) is not None
     publisher.close()
-    await until(lambda: world.node.count_publishers("/port_topic") == 0)
+    await until(lambda: not world.node.find_publishers("/port_topic"))
+    client.close()

@@ -253,6 +253,23 @@ async def test_a_forged_report_of_another_server_ends_nothing(world: World) -> N
     forger.close()
 
 
+async def test_a_server_does_not_take_part_because_another_process_says_so(world: World) -> None:
+    world.server.serve(ECHO, "/told", echo_call)
+    await world.client.wait_for_service(ECHO, "/told", timeout=LIMIT)
+    pool = world.client.pool.service(ECHO, "/told", None)
+    (server,) = world.client.core.node.find_servers(pool.service)
+    # The client's own process is another than the server's.
+    forger = world.client.core.node.open_publisher(
+        DiagnosticStatus, report_topic(str(process_of(server))), TopicQos()
+    )
+    topic = report_topic(str(process_of(server)))
+    await until(lambda: world.client.core.node.find_publishers(topic))
+    world.client.core.pool.listener.on_servers(frozenset({server}))
+    assert not world.client.core.pool.listener.hears(frozenset({server}))
+    assert answer_to(await world.call("answered")) == "answered"
+    forger.close()
+
+
 async def test_nothing_is_created_without_status(session: Session, bridge: Bridge) -> None:
     async with Session("plain", bridge=bridge) as client:
         session.serve(ECHO, "/plain", echo_call)

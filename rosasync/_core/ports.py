@@ -403,8 +403,8 @@ class NodePort(Protocol):
             ContextShutdown: the node is down.
         """
 
-    def count_publishers(self, topic_name: str) -> int:
-        """Return how many publishers a topic has, in all processes. Cheap.
+    def find_publishers(self, topic_name: str) -> frozenset[Hashable]:
+        """Identify the publishers of a topic, in all processes. Cheap if there are none.
 
         Raises:
             ContextShutdown: the node is down.

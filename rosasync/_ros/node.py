@@ -35,7 +35,7 @@ from rosasync._core.ports import (
 from rosasync._ros import configuration, discovery, names, profile, rcl
 from rosasync._ros.direct_bridge import DirectBridge
 from rosasync._ros.domain import check_domain, environment_domain
-from rosasync._ros.endpoints import response_readers, response_writers
+from rosasync._ros.endpoints import gid_of, response_readers, response_writers
 from rosasync._ros.executor_bridge import ExecutorBridge
 from rosasync._ros.executor_thread import ExecutorThread, ThreadUser, executor_thread_of
 from rosasync._ros.failures import (
@@ -253,10 +253,13 @@ class RosNode:
         """Identify the servers that fit: by name, type and QoS."""
         return self._graph.find_servers(service)
 
-    def count_publishers(self, topic_name: str) -> int:
-        """Return how many publishers a topic has, in all processes."""
+    def find_publishers(self, topic_name: str) -> frozenset[Hashable]:
+        """Identify the publishers of a topic, in all processes."""
         with uses_node(self._node):
-            return int(self._node.count_publishers(topic_name))
+            # The count takes a microsecond, and the list some hundred.
+            if not self._node.count_publishers(topic_name):
+                return frozenset()
+            return frozenset(map(gid_of, self._node.get_publishers_info_by_topic(topic_name)))
 
     def name_servers(self, service: Service) -> tuple[str, ...]:
         """Return the full names of the nodes that serve this name and type, as far as known."""

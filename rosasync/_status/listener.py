@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Hashable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from rosasync._core.ports import PortDestroyed, TopicQos
@@ -57,14 +58,14 @@ class Listener:
     def on_servers(self, servers: Servers) -> None:
         """Listen to the processes of these servers that take part; for every new generation."""
         for known, process in tuple(self._processes.items()):
-            if not self._node.count_publishers(report_topic(known)):
+            if not self._takes_part(known):
                 process.close()
                 del self._processes[known]
         for name in {process_of(server) for server in servers}:
             if name is None or name in self._processes:
                 continue
-            if self._node.count_publishers(report_topic(name)):
-                self._processes[name] = _Process(self._node, name, self._on_message)
+            if self._takes_part(name):
+                self._processes[name] = _Process(self._node, name, partial(self._take, name))
 
     def hears(self, servers: Servers) -> bool:
         """Return whether all of these servers take part, and both sides are matched."""
@@ -91,14 +92,20 @@ class Listener:
         self._processes.clear()
         self._clients.clear()
 
-    def _on_message(self, message: Any) -> None:
+    def _takes_part(self, process: str) -> bool:
+        """Return whether a process publishes reports itself, and not only another in its name."""
+        publishers = self._node.find_publishers(report_topic(process))
+        return process in map(process_of, publishers)
+
+    def _take(self, process: str, message: Any) -> None:
+        """Take a message from the topic of a process."""
         try:
             report = Report.read(message)
         except ValueError as error:
             logger.debug("a message on the topic of reports is none: %s", error)
             return
         on_report = self._clients.get(report.client)
-        if on_report is not None:
+        if on_report is not None and process_of(report.server) == process:
             on_report(report)
 
 

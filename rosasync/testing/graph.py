@@ -456,9 +456,13 @@ class FakeNode:
         servers = self.graph.find(service.key.srv_type, service.key.srv_name)
         return tuple(f"/server_{number}" for number, _ in enumerate(servers, start=1))
 
-    def count_publishers(self, topic_name: str) -> int:
-        """Return how many publishers a topic has."""
-        return sum(publisher.topic_name == topic_name for publisher in self.graph.publishers)
+    def find_publishers(self, topic_name: str) -> frozenset[Hashable]:
+        """Identify the publishers of a topic."""
+        return frozenset(
+            publisher.identity
+            for publisher in self.graph.publishers
+            if publisher.topic_name == topic_name
+        )
 
     def explain_missing(self, service: Service) -> str:
         """List the services in the graph, with their types."""
@@ -565,6 +569,7 @@ class FakePublisher:
         self.node = node
         self.msg_type = msg_type
         self.topic_name = topic_name
+        self.identity = _new_identity(node.process)
         self.closed = False
         self.published: list[Any] = []
         self._kept: deque[Any] = deque(maxlen=qos.depth if qos.latched else 0)
