@@ -172,7 +172,8 @@ def section(trials: Trials) -> str:
             "`python -m benchmarks cold --after-crash`. Processes are killed and replaced one "
             "after the other. For a client: from its call to the answer of a stock server that "
             "stays. For a server: from its being ready to the next answer at a stock client that "
-            "calls all the time.\n",
+            "calls all the time. The time of a client has its discovery in it, which a session "
+            "shortens.\n",
             f"{trials.conditions}\n",
             markdown_table(heading, rows(restarts)),
         )

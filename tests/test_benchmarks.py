@@ -336,6 +336,7 @@ SMALL_RUNS = {
     "sharing": ("--contestants=direct,semaphore", "--processes=2", "--work=1", "--seconds=0.3"),
     "faults": ("--situations=slow server", "--contestants=direct-retry"),
     "cold": ("--processes=1",),
+    "crash": ("--after-crash", "--processes=1"),
 }
 
 
@@ -352,7 +353,10 @@ def test_the_window_is_drawn(tmp_path: Path) -> None:
 def test_a_small_run(command: str, tmp_path: Path) -> None:
     file = tmp_path / "rows.json"
     subprocess.run(
-        [sys.executable, "-m", "benchmarks", command, *SMALL_RUNS[command], f"--json={file}"],
+        [
+            *(sys.executable, "-m", "benchmarks", "cold" if command == "crash" else command),
+            *(*SMALL_RUNS[command], f"--json={file}"),
+        ],
         cwd=ROOT,
         check=True,
         stdout=subprocess.DEVNULL,
