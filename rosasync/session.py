@@ -138,7 +138,8 @@ class Session:
         Raises:
             ImportError: rclpy is not installed, or the middleware that ``RMW_IMPLEMENTATION``
                 names; the message says what to do.
-            UsageError: the session was opened before, or the bridge asked for does not work here.
+            UsageError: the session was opened before, the bridge asked for does not work here, the
+                ROS domain does not exist, or the process was forked from one that has used ROS.
             TypeError: ``node`` is neither a name nor an rclpy node.
             ValueError: ROS does not allow the node's name.
             SessionClosed: the session was closed during the opening.
