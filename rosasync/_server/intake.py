@@ -70,7 +70,7 @@ class Intake(Generic[RequestT, ResponseT]):
         self._log.update(
             backlog.standing or bool(dropped), len(dropped), len(backlog), backlog.oldest_age(now)
         )
-        if call.trace is not None:
+        if call.trace is not None and call not in dropped:
             call.trace.enter("queued")
         self._wake_next()
         for other in dropped:
