@@ -94,14 +94,12 @@ class Core:
             return f"{name} belongs to the loop of another thread: use session.from_thread here"
         if asyncio._get_running_loop() is None:
             return f"{name} is used without a running event loop: use it in a coroutine of its loop"
+        hint = ""
         if "pytest_asyncio" in sys.modules:
-            return (
-                f"{name} belongs to another event loop: give the fixture that opens it the "
-                "loop_scope of the test, as in @pytest_asyncio.fixture(loop_scope=…)"
-            )
+            hint = "; in a test, give the fixture that opens it the loop_scope of the test"
         return (
             f"{name} belongs to another event loop, and asyncio.run makes a new one each time: "
-            "open a session in each loop, or run everything in one"
+            f"open a session in each loop, or run everything in one{hint}"
         )
 
     def serve(
