@@ -67,13 +67,18 @@ class OpenTelemetryTrace:
     Args:
         tracer_provider: makes the spans; None for the global one.
         meter_provider: makes the instruments; None for the global one.
+        action_calls: whether the calls that a goal of an action is made of have spans of their own,
+            besides the goal's.
     """
 
     def __init__(
         self,
         tracer_provider: TracerProvider | None = None,
         meter_provider: MeterProvider | None = None,
+        *,
+        action_calls: bool = False,
     ) -> None:
+        self.action_calls = action_calls
         self._tracer = trace.get_tracer("rosasync", None, tracer_provider, SCHEMA)
         self._meter = metrics.get_meter("rosasync", "", meter_provider, SCHEMA)
         self._durations = {side: self._make_histogram(side) for side in ("client", "server")}
@@ -121,7 +126,7 @@ class OpenTelemetryTrace:
         """End the span, and record the duration."""
         running = self._calls.pop(call.number)
         span, attributes = running.span, running.attributes
-        if end.error is not None or end.outcome != "answered":
+        if end.error is not None or end.outcome not in ("answered", "detached"):
             attributes["error.type"] = _error_type(end)
             span.set_attribute("error.type", attributes["error.type"])
             span.set_status(StatusCode.ERROR, str(end.error or end.outcome))

@@ -82,7 +82,8 @@ class CallPhase:
     """The beginning of a phase of a call. A call may skip phases.
 
     On the client's side, a call is ``"waiting"`` for a server, ``"queued"`` for a place in the
-    window, ``"sent"``, and ``"sent again"`` for each retry.
+    window, ``"sent"``, and ``"sent again"`` for each retry. The goal of an action is one call, and
+    besides ``"accepted"`` and ``"canceling"``.
 
     On the server's side, it is ``"queued"`` for a handler, ``"handling"`` in one, ``"failed"`` if
     the handler or a hook has raised an exception, and ``"deferred"`` if the handler has returned
@@ -104,8 +105,8 @@ class CallEnd:
     """The end of a call.
 
     Attributes:
-        outcome: ``"answered"``; on the client's side otherwise ``"timed out"``, ``"cancelled"`` or
-            ``"failed"``; on the server's side otherwise ``"failed"`` or ``"cancelled"`` as its
+        outcome: ``"answered"``; on the client's side otherwise ``"timed out"``, ``"cancelled"``,
+            ``"failed"``, or ``"detached"`` for a goal that was left running; on the server's side otherwise ``"failed"`` or ``"cancelled"`` as its
             handler, ``"undeliverable"`` if the client cannot get the response, or ``"dropped"`` if
             nothing answered it.
         time_ns: when it ended, in ns of ``time.monotonic_ns()``.

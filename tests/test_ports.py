@@ -309,7 +309,11 @@ async def test_statuses_are_read_without_deserializing_them(world: World) -> Non
         statuses = read_statuses(serialized)
         assert statuses is not None
         assert list(statuses) == [(bytes([i] * 16), i + 1) for i in range(count)]
+        padded = read_statuses(serialized + b"\0\0\0")
+        assert padded is not None
+        assert len(list(padded)) == count
         assert read_statuses(serialized[:-1]) is None or count == 0
+        assert read_statuses(serialized + b"\0" * 7) is None or count == 0
     publisher.close()
     subscription.close()
 

@@ -455,9 +455,9 @@ class ActionClient:
         elif now >= goal.ask_at:
             self._ask(goal)
 
-    def _ask(self, goal: ActiveGoal) -> None:
+    def _ask(self, goal: ActiveGoal, room: bool = False) -> None:
         """Ask for the result, now and again at growing intervals."""
-        self._results.ask(goal.key)
+        self._results.ask(goal.key, room=room)
         goal.ask_at = self._loop.time() + goal.ask_delay
         goal.ask_delay = min(2 * goal.ask_delay, LAST_ASK)
 
@@ -557,7 +557,7 @@ class ActionClient:
             if goal.trace is not None:
                 goal.trace.enter("accepted")
             goal.ask_delay = FIRST_ASK if goal.ended_at is None else ENDED_ASK
-            self._ask(goal)
+            self._ask(goal, room=stamp is not None)
         goal.answered.set()
 
     def _rejected(self, goal: ActiveGoal) -> None:

@@ -77,10 +77,19 @@ class ResultRequests:
             self._replace()
             return False
 
-    def ask(self, key: bytes) -> None:
-        """Ask for the result of a goal, now or as soon as the pace allows."""
+    def ask(self, key: bytes, *, room: bool = False) -> None:
+        """Ask for the result of a goal, now or as soon as the pace allows.
+
+        Args:
+            key: the bytes of the goal's UUID.
+            room: whether the server has just accepted a goal. Then it takes requests, and has room
+                for one more than the pace allows.
+        """
         self._queue[key] = None
-        if self._timer is None:
+        if room:
+            self._left += 1
+        waits_for_match = self._poll != POLL_MIN
+        if self._timer is None or (self._left and not waits_for_match):
             self._send()
 
     def forget(self, key: bytes) -> None:
@@ -110,8 +119,9 @@ class ResultRequests:
 
     def _send_burst(self) -> None:
         if not self.ready():
-            self._timer = self._loop.call_later(self._poll, self._continue)
-            self._poll = min(2 * self._poll, POLL_MAX)
+            if self._timer is None:
+                self._timer = self._loop.call_later(self._poll, self._continue)
+                self._poll = min(2 * self._poll, POLL_MAX)
             return
         self._poll = POLL_MIN
         while self._queue and self._left:

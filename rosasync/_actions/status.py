@@ -64,12 +64,14 @@ def read_statuses(serialized: bytes) -> Iterator[tuple[bytes, int]] | None:
     count = int.from_bytes(serialized[4:8], "little" if little else "big")
     if not count and len(serialized) >= 8:
         return iter(())
-    if len(serialized) != _FIRST_STATUS + 1 + _NEXT.size * (count - 1):
+    size = _FIRST_STATUS + 1 + _NEXT.size * (count - 1)
+    # The middleware pads what comes from another process to a multiple of four bytes.
+    if not 0 <= len(serialized) - size < 4:
         return None
-    return _read(serialized)
+    return _read(memoryview(serialized)[:size])
 
 
-def _read(serialized: bytes) -> Iterator[tuple[bytes, int]]:
+def _read(serialized: memoryview) -> Iterator[tuple[bytes, int]]:
     # Only numbers are aligned, so the first element lacks the padding of the others.
-    yield serialized[_FIRST : _FIRST + 16], serialized[_FIRST_STATUS]
-    yield from _NEXT.iter_unpack(memoryview(serialized)[_FIRST_STATUS + 1 :])
+    yield bytes(serialized[_FIRST : _FIRST + 16]), serialized[_FIRST_STATUS]
+    yield from _NEXT.iter_unpack(serialized[_FIRST_STATUS + 1 :])

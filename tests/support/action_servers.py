@@ -263,8 +263,11 @@ class _Servers:
         deadline = time.monotonic() + LIMIT
         while not publisher.get_subscription_count() and time.monotonic() < deadline:
             time.sleep(0.01)
-        publisher.publish(b"\0\1\0\0" + bytes.fromhex(goal_id))
-        publisher.publish(b"\0\1\0\0")
+        # More than once, because a subscription may know its publisher later than the reverse.
+        for _ in range(10):
+            publisher.publish(b"\0\1\0\0" + bytes.fromhex(goal_id))
+            publisher.publish(b"\0\1\0\0")
+            time.sleep(0.02)
         self._node.destroy_publisher(publisher)
 
     def clear(self) -> None:
