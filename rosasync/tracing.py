@@ -106,9 +106,9 @@ class CallEnd:
 
     Attributes:
         outcome: ``"answered"``; on the client's side otherwise ``"timed out"``, ``"cancelled"``,
-            ``"failed"``, or ``"detached"`` for a goal that was left running; on the server's side otherwise ``"failed"`` or ``"cancelled"`` as its
-            handler, ``"undeliverable"`` if the client cannot get the response, or ``"dropped"`` if
-            nothing answered it.
+            ``"failed"``, or ``"detached"`` for a goal that was left running; on the server's side
+            otherwise ``"failed"`` or ``"cancelled"`` as its handler, ``"undeliverable"`` if the
+            client cannot get the response, or ``"dropped"`` if nothing answered it.
         time_ns: when it ended, in ns of ``time.monotonic_ns()``.
         error: on the client's side, what the caller gets; on the server's side, what the handler
             raised, also if ``on_error`` answered.
