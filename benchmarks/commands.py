@@ -13,11 +13,11 @@ import typer
 from matplotlib.figure import Figure
 from rich.progress import Progress
 
-from benchmarks import actions, cold, crash, faults, overload, sharing
+from benchmarks import actions, cold, crash, faults, overload, sharing, status
 from benchmarks.hosts import NoHosts
 from benchmarks.pages import replace_section
 from benchmarks.tables import make_console, make_table
-from benchmarks.trials import Goal, Trials
+from benchmarks.trials import Goal, Trials, check
 from rosasync._ros.domain import isolate
 
 __all__ = ["add_commands", "save"]
@@ -39,6 +39,7 @@ def add_commands(app: typer.Typer) -> None:
     app.command("faults")(fail)
     app.command("cold")(start)
     app.command("actions")(act)
+    app.command("status")(report_failures)
     app.command("publish")(publish)
 
 
@@ -62,6 +63,18 @@ def share(
     with collected(trials, sharing.heading, sharing.row, len(chosen), json) as add:
         cells = sharing.measure(chosen, callers, seconds, before, add)
     show_goals(sharing.goals(cells))
+
+
+def report_failures(
+    calls: Annotated[int, typer.Option(min=10, help="Calls of each kind.")] = 500,
+) -> None:
+    """How soon a caller learns that the handler has raised, beside an ordinary answer."""
+    isolate()
+    found = status.measure(calls)
+    heading = ["handler", "calls", "median ms", "99 % ms", "÷ answered"]
+    make_console().print(make_table("status=True", heading, list(status.rows(found))))
+    median = sorted(found["failed"])[len(found["failed"]) // 2]
+    show_goals([check("seconds from the raise to the error, median", median, "<=", status.TARGET)])
 
 
 def overload_server(

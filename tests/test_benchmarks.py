@@ -24,6 +24,7 @@ from benchmarks import (
     pages,
     profile,
     sharing,
+    status,
 )
 from benchmarks.contestants import CONTESTANTS, make_contestant
 from benchmarks.contestants.base import LoggedCall
@@ -466,3 +467,11 @@ def test_a_small_run_of_overload() -> None:
     cells = overload.measure(chosen, 1.0)
     assert [cell.kind for cell in cells].count("offered") == 6
     assert all(cell.sent for cell in cells)
+
+
+@pytest.mark.slow
+def test_a_small_run_of_status() -> None:
+    found = status.measure(10)
+    assert {kind: len(seconds) for kind, seconds in found.items()} == {"failed": 10, "answered": 10}
+    assert all(seconds > 0 for kind in found.values() for seconds in kind)
+    assert [row[0] for row in status.rows(found)] == ["failed", "answered"]
