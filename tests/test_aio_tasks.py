@@ -136,3 +136,13 @@ async def test_an_error_reaches_it_and_the_task() -> None:
     with pytest.raises(ValueError, match="no"):
         await task
     assert work.steps == ["begun", "ValueError", "left"]
+
+
+async def test_a_task_that_is_cancelled_after_it_failed_at_once_is_cancelled() -> None:
+    async def fail() -> None:
+        raise ValueError
+
+    task = start_task(asyncio.get_running_loop(), fail())
+    task.cancel()
+    await asyncio.wait([task])
+    assert task.cancelled()

@@ -146,9 +146,15 @@ class _Started(Coroutine[Any, Any, T]):
         return self._awaited
 
     def throw(self, *error: Any) -> Any:
-        """Raise an exception in the coroutine, or its outcome if it has ended."""
+        """Raise an exception in the coroutine, or its outcome if it has ended.
+
+        If it ended by an error before the task began, a cancellation comes first: who has cancelled
+        the task does not ask for the error, and asyncio would log that it was never retrieved.
+        """
         first, self._resumed = not self._resumed, True
         if self._outcome is not None:
+            if first and not isinstance(self._outcome, StopIteration):
+                raise error[0]
             raise self._outcome
         if first and self._awaited is not None:
             # The task has not seen this future yet, so it cannot cancel it itself.

@@ -164,12 +164,14 @@ def test_timeouts(full: bool) -> None:
     def check(timeout: Any) -> None:
         how = asyncio.run(Answered().call(timeout=timeout))
         if how == "timed out":
+            # Also if it is negative: no time is left.
             assert float(timeout) < TICK
         if timeout is None or timeout is ...:
             assert how == "answered"
 
     check()
-    for refused in (math.nan, -1, True, "1", 10**400, numpy.bool_(True), decimal.Decimal(9)):
+    assert asyncio.run(Answered().call(timeout=-1)) == "timed out"
+    for refused in (math.nan, True, "1", 10**400, numpy.bool_(True), decimal.Decimal(9)):
         assert asyncio.run(Answered().call(timeout=refused)) == "refused", refused
     for accepted in (math.inf, LIMIT, fractions.Fraction(9), numpy.float32(9), numpy.int8(9)):
         assert asyncio.run(Answered().call(timeout=accepted)) == "answered", accepted
