@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 import time
 import uuid
 from collections.abc import Iterator
@@ -176,9 +175,9 @@ class TestStates:
             await stock.cancel_handle(goal)
         assert await stock.ended(goal) == Ended(S.ABORTED, [9])
         assert (await stock.statuses(name, goal, S.ABORTED))[-1] == S.ABORTED
-        (record,) = [r for r in caplog.records if r.levelno >= logging.WARNING]
-        assert "aborted" in record.getMessage()
-        assert "blocked" in record.getMessage()
+        # On a busy machine there is also a warning about a loop that was blocked.
+        (message,) = [r.getMessage() for r in caplog.records if "aborted" in r.getMessage()]
+        assert "blocked" in message
 
 
 class TestCancelling:

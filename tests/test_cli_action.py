@@ -18,6 +18,8 @@ from tests.support.action_clients import ActionClientProcess, Ended
 from tests.support.command import LIMIT, json_lines, rosasync, terminal
 from tests.support.process import ROOT, ended
 
+pytestmark = pytest.mark.slow
+
 FIBONACCI = "test_msgs/action/Fibonacci"
 QUICK, SLOW = "/cli/quick", "/cli/slow"
 SUCCEEDED, CANCELED, ABORTED = 4, 5, 6

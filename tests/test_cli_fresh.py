@@ -25,6 +25,8 @@ from tests.support.command import json_lines, rosasync
 from tests.support.process import ROOT, ended, first_line
 from tests.support.times import LIMIT
 
+pytestmark = pytest.mark.slow
+
 VARIABLE = profile_variable(is_old())
 SHOW = (sys.executable, "-c", f"import os; print(open(os.environ['{VARIABLE}']).read())")
 NODE = """

@@ -14,7 +14,7 @@ PROFILE, OTHER_PROFILE = "FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROF
 if not version("rclpy").startswith("7."):
     PROFILE, OTHER_PROFILE = OTHER_PROFILE, PROFILE
 
-pytestmark = pytest.mark.usefixtures("lamp")
+pytestmark = [pytest.mark.usefixtures("lamp"), pytest.mark.slow]
 
 
 def test_list() -> None:
@@ -39,7 +39,7 @@ def test_type_and_find() -> None:
     assert rosasync("type", LAMP).stdout == f"{LAMP_TYPE}\n"
     assert LAMP in rosasync("find", LAMP_TYPE).stdout.splitlines()
     assert json_lines(rosasync("find", "nav_msgs/srv/GetMap", "--json").stdout) == []
-    missing = rosasync("type", "/lamp/none", "--timeout", "1")
+    missing = rosasync("type", "/lamp/swich", "--timeout", "1")
     assert (missing.returncode, missing.stdout) == (3, "")
     assert f"there are {LAMP} ({LAMP_TYPE})" in missing.stderr
 

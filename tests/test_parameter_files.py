@@ -174,7 +174,13 @@ def test_encodings(stock: StartedProcess, tmp_path: Path, encoding: str) -> None
 
 
 relaxed = settings(
-    deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    deadline=None,
+    max_examples=60,
+    suppress_health_check=[
+        HealthCheck.function_scoped_fixture,
+        # Each bridge is an executor of its own, for hypothesis.
+        HealthCheck.differing_executors,
+    ],
 )
 
 numbers = st.one_of(

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile
+from std_srvs.srv import Trigger
 
 from rosasync._core.ports import PortDestroyed, Undeliverable, Unmatched
 from rosasync._ros import responder
@@ -21,7 +22,7 @@ from rosasync._ros.responder import (
     client_of,
 )
 from rosasync._server.resending import RESEND
-from rosasync.errors import ContextShutdown
+from rosasync.errors import ContextShutdown, RosasyncError
 from tests.support.times import LIMIT, TICK
 
 BLOCKED = 0.1
@@ -49,6 +50,9 @@ class Header:
         self.source_timestamp = self.received_timestamp = 0
 
 
+RESPONSE = Trigger.Response()
+
+
 class Middleware:
     """A node, its only service and the graph, with a clock of their own.
 
@@ -66,6 +70,7 @@ class Middleware:
         self.pointer = 1
         self.up = True
         self.service_name = "/served"
+        self.srv_type = Trigger
         self.now = 100.0
         self.unmatched: set[bytes] = set()
         self.report = "error"
@@ -140,7 +145,7 @@ def service(middleware: Middleware) -> Responder:
 def fail(service: Responder, client: bytes, *, known: bool = True) -> str:
     """Send a response that cannot arrive yet, and return the reason."""
     with pytest.raises(Unmatched) as caught:
-        service.send(Header(client, known), "response")
+        service.send(Header(client, known), RESPONSE)
     return str(caught.value)
 
 
@@ -154,7 +159,7 @@ def test_a_client_that_is_not_discovered_blocks_once(
     fail(service, BAD)
     for _ in range(100):
         assert "not discovered completely" in fail(service, BAD)
-        service.send(Header(GOOD), "response")
+        service.send(Header(GOOD), RESPONSE)
         middleware.now += STEP
     assert middleware.sent.count(BAD) == 1
     assert middleware.sent.count(GOOD) == 100
@@ -172,7 +177,7 @@ def test_it_gets_its_responses_when_it_has_been_visible_for_a_moment(
     middleware.unmatched.clear()
     middleware.now += STEP
     for _ in range(5):
-        service.send(Header(BAD), "response")
+        service.send(Header(BAD), RESPONSE)
     assert middleware.sent == [BAD] * 6
 
 
@@ -185,10 +190,10 @@ def test_one_that_cannot_be_matched_although_it_is_visible_is_given_up(
     for _ in range(int(2 * sum(MATCH_DELAYS) / STEP)):
         middleware.now += STEP
         with pytest.raises(Undeliverable):
-            service.send(Header(BAD), "response")
+            service.send(Header(BAD), RESPONSE)
     assert middleware.sent == [BAD] * (1 + len(MATCH_DELAYS))
     with pytest.raises(Undeliverable, match="does not match it"):
-        service.send(Header(BAD), "response")
+        service.send(Header(BAD), RESPONSE)
 
 
 def test_one_whose_match_takes_longer_than_a_send_waits_gets_its_response(
@@ -201,7 +206,7 @@ def test_one_whose_match_takes_longer_than_a_send_waits_gets_its_response(
         assert "just now" in fail(service, BAD)
         middleware.now += MATCH_DELAYS[-1]
     middleware.unmatched.clear()
-    service.send(Header(BAD), "response")
+    service.send(Header(BAD), RESPONSE)
     assert middleware.sent == [BAD] * (1 + len(MATCH_DELAYS))
 
 
@@ -214,9 +219,9 @@ def test_a_qos_that_cannot_match_is_refused_at_once(
     middleware.join(BAD, TRANSIENT)
     for _ in range(100):
         with pytest.raises(Undeliverable, match="QoS") as caught:
-            service.send(Header(BAD), "response")
+            service.send(Header(BAD), RESPONSE)
         assert not isinstance(caught.value, Unmatched)
-        service.send(Header(GOOD), "response")
+        service.send(Header(GOOD), RESPONSE)
         middleware.now += 1.0
     assert middleware.sent.count(BAD) == 1
     assert middleware.sent.count(GOOD) == 100
@@ -237,7 +242,7 @@ def test_others_that_join_meanwhile_do_not_block_at_all(
         middleware.readers[other] = VOLATILE
     middleware.now += STEP
     for other in others:
-        service.send(Header(other), "response")
+        service.send(Header(other), RESPONSE)
     assert middleware.sent == [BAD, *others]
 
 
@@ -248,7 +253,7 @@ def test_a_slow_send_to_a_visible_client_has_sent(
     middleware.report = "nothing"
     middleware.unmatched.add(GOOD)
     for _ in range(3):
-        service.send(Header(GOOD), "response")
+        service.send(Header(GOOD), RESPONSE)
     assert middleware.sent == [GOOD] * 3
 
 
@@ -292,7 +297,7 @@ def test_a_failed_send_is_not_taken_for_that_of_another_thread(
 
     def send_good() -> None:
         try:
-            service.send(Header(GOOD), "response")
+            service.send(Header(GOOD), RESPONSE)
         except Exception as error:
             errors.append(error)
 
@@ -312,13 +317,13 @@ def test_clients_that_left_are_forgotten(middleware: Middleware, service: Respon
         middleware.leave(bad)
         middleware.now += WATCH_TIME
         middleware.unmatched.clear()
-        service.send(Header(bad), "dropped by the middleware without waiting")
+        service.send(Header(bad), RESPONSE)
         assert not service._unreached
     middleware.now += WATCH_TIME
     before = middleware.queries
     for _ in range(10):
         middleware.now += WATCH_TIME
-        service.send(Header(GOOD), "response")
+        service.send(Header(GOOD), RESPONSE)
     assert middleware.queries == before
 
 
@@ -333,7 +338,7 @@ def test_few_clients_are_remembered(
         middleware.join(bad, TRANSIENT)
         middleware.now += 2 * WATCH_TIME
         with pytest.raises(Undeliverable):
-            service.send(Header(bad), "response")
+            service.send(Header(bad), RESPONSE)
     assert len(service._unreached) == 3
 
 
@@ -351,8 +356,8 @@ def test_without_an_identity_one_attempt_in_a_while_may_block(
     middleware.readers[BAD] = VOLATILE
     middleware.unmatched.clear()
     middleware.now += STEP
-    service.send(Header(BAD, known=False), "response")
-    service.send(Header(GOOD, known=False), "response")
+    service.send(Header(BAD, known=False), RESPONSE)
+    service.send(Header(GOOD, known=False), RESPONSE)
 
 
 def test_without_an_identity_a_qos_that_cannot_match_blocks_once_in_a_while(
@@ -371,7 +376,7 @@ def test_the_graph_is_queried_only_after_a_slow_send(
     middleware: Middleware, service: Responder
 ) -> None:
     for _ in range(10):
-        service.send(Header(GOOD), "response")
+        service.send(Header(GOOD), RESPONSE)
     assert middleware.queries == 0
     middleware.unmatched.add(BAD)
     middleware.join(BAD, reader=False)
@@ -391,7 +396,7 @@ def test_a_graph_that_names_topics_otherwise_holds_nothing_back(
     fail(service, GOOD)
     middleware.unmatched.clear()
     middleware.now += STEP
-    service.send(Header(GOOD), "response")
+    service.send(Header(GOOD), RESPONSE)
     assert middleware.sent == [GOOD, GOOD]
 
 
@@ -403,7 +408,7 @@ def test_other_errors_of_the_interpreter_pass(
 
     monkeypatch.setattr(middleware, "service_send_response", failing)
     with pytest.raises(SystemError, match="another one"):
-        Responder(middleware, middleware, VOLATILE).send(Header(GOOD), "response")
+        Responder(middleware, middleware, VOLATILE).send(Header(GOOD), RESPONSE)
 
 
 def test_what_rcl_refuses_is_named(middleware: Middleware, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -412,14 +417,14 @@ def test_what_rcl_refuses_is_named(middleware: Middleware, monkeypatch: pytest.M
 
     monkeypatch.setattr(middleware, "service_send_response", failing)
     service = Responder(middleware, middleware, VOLATILE)
-    with pytest.raises(Undeliverable, match="refused"):
-        service.send(Header(GOOD), "response")
+    with pytest.raises(RosasyncError, match="refuses the response: refused"):
+        service.send(Header(GOOD), RESPONSE)
     middleware.pointer = 0
     with pytest.raises(ContextShutdown):
-        service.send(Header(GOOD), "response")
+        service.send(Header(GOOD), RESPONSE)
     service._node = Middleware()
     with pytest.raises(PortDestroyed):
-        service.send(Header(GOOD), "response")
+        service.send(Header(GOOD), RESPONSE)
 
 
 def test_a_server_tries_for_longer_than_it_watches() -> None:

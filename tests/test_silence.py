@@ -17,6 +17,8 @@ from tests.support.process import ROOT, ended, first_line
 from tests.support.program import as_root, own_shared_memory
 from tests.support.times import LIMIT, TICK
 
+pytestmark = pytest.mark.slow
+
 EMPTY = "std_srvs/srv/Empty"
 NAME = "/silent/_hidden/server"
 NOBODY = 65534
