@@ -167,7 +167,7 @@ class Call:
         self._wait(plan.next_delay())
 
     def on_later_answer(self, number: int) -> None:
-        """Take note that a request of the client was answered; the third later one is decisive."""
+        """Record that a request of the client was answered; the third later one is decisive."""
         if self.plan is None or self.newest is None or number <= self.newest.number:
             return
         if self.plan.on_later_answer() is Action.SEND:
@@ -175,7 +175,7 @@ class Call:
             self._send_again()
 
     def lose(self, lost: Sent, error: Callable[[], Exception]) -> None:
-        """Take note that no server has an attempt any more.
+        """Record that no server has an attempt any more.
 
         If it was the last one, go to the next server if the plan allows it; otherwise set the
         error.
@@ -189,7 +189,7 @@ class Call:
         self._send_again()
 
     def refuse(self, refused: Sent, report: Report) -> None:
-        """Take note that the servers of an attempt have reported not to answer it.
+        """Record that the servers of an attempt have reported not to answer it.
 
         If it was the last one: a server that has closed is like one that is gone. A request that
         was dropped is sent again when it is due, if the plan has an attempt left. All else ends the

@@ -168,7 +168,7 @@ class Client:
         return sent
 
     def leave(self, sent: Sent, now: float) -> None:
-        """Take note that the caller of a request has left."""
+        """Record that the caller of a request has left."""
         # The loop is closed if a task that was still pending is collected.
         if self.closed or self._loop.is_closed():
             return

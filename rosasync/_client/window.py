@@ -163,7 +163,7 @@ class Window:
         return (newest.place or newest.leased) and self._has_left(newest)
 
     def supersede(self, sent: Sent) -> None:
-        """Take note that a request is about to be sent again.
+        """Record that a request is about to be sent again.
 
         If the attempt before may still be in the queue, it keeps a place of its own.
         """
@@ -179,7 +179,7 @@ class Window:
             self.abandoned[sent.number] = sent
 
     def leave(self, sent: Sent, now: float) -> None:
-        """Take note that the caller of a request has left.
+        """Record that the caller of a request has left.
 
         The request keeps a place if it may still be in the queue. Its late response is expected for
         the grace period in any case.
