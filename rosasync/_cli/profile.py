@@ -47,7 +47,6 @@ def profile(
     \b
     Examples:
       $ rosasync profile
-      $ rosasync profile --distribution kilted
       $ rosasync profile --fresh
     """
     old = is_old() if distribution is None else distribution is Distribution.JAZZY
