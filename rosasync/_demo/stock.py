@@ -83,12 +83,21 @@ def _answer_in_a_loop(context: Context, services: list[Any]) -> None:
         for service in services:
             wait_set.add_service(service)
         wait_set.wait(-1)
-        for service in services:
-            while (taken := service.service_take_request(Echo.Request))[0] is not None:
-                request, header = taken
-                service.service_send_response(_echo(request, Echo.Response()), header.request_id)
+        try:
+            for service in services:
+                _answer_all(service)
+        except _rclpy.RCLError:
+            # Ctrl-C may shut the context down in the middle.
+            if context.ok():
+                raise
     wait_set.destroy_when_not_in_use()
     guard.destroy_when_not_in_use()
+
+
+def _answer_all(service: Any) -> None:
+    while (taken := service.service_take_request(Echo.Request))[0] is not None:
+        request, header = taken
+        service.service_send_response(_echo(request, Echo.Response()), header.request_id)
 
 
 def _echo(request: Any, response: Any) -> Any:

@@ -21,12 +21,15 @@ from rosasync.errors import ContextShutdown
 if TYPE_CHECKING:
     from rosasync._core.ports import NodePort, PublisherPort, Servers, SubscriptionPort
 
-__all__ = ["BURST", "Listener"]
+__all__ = ["BURST", "REPORTS", "Listener"]
 
 logger = logging.getLogger("rosasync")
 
 BURST = TopicQos(depth=1000)
-"""For the reports and departures of a burst: a thousand callers may leave at once."""
+"""For the departures of a burst: a thousand callers may leave at once."""
+REPORTS = TopicQos(depth=100, latched=True)
+"""For reports. The last are kept for a listener that is about to be matched: the first call of a
+client may fail sooner. Of other clients' requests, they say nothing to it."""
 
 
 class Listener:
@@ -122,7 +125,7 @@ class _Process:
             ServiceEventInfo, departure_topic(name), BURST
         )
         self._reports: SubscriptionPort = node.open_subscription(
-            DiagnosticStatus, report_topic(name), BURST, on_message
+            DiagnosticStatus, report_topic(name), REPORTS, on_message
         )
 
     def is_matched(self) -> bool:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from rosasync._core.ports import PortDestroyed
-from rosasync._status.listener import BURST
+from rosasync._status.listener import BURST, REPORTS
 from rosasync._status.wire import Departure, departure_topic, process_of, report_topic
 from rosasync.errors import ContextShutdown
 
@@ -62,7 +62,7 @@ class Reporter:
 
             self._process, self._type = process, DiagnosticStatus
             self._reports = self._node.open_publisher(
-                DiagnosticStatus, report_topic(process), BURST
+                DiagnosticStatus, report_topic(process), REPORTS
             )
         self.on_graph()
 
@@ -80,8 +80,8 @@ class Reporter:
             )
 
     def report(self, report: Report) -> None:
-        """Publish a report, if a caller listens."""
-        if self._reports is not None and self._is_heard():
+        """Publish a report. The last are kept for listeners that come soon."""
+        if self._reports is not None:
             message = self._node.make_message(self._type, report.to_mapping())
             self._reports.publish(message)
 
