@@ -85,15 +85,6 @@ class Reporter:
             message = self._node.make_message(self._type, report.to_mapping())
             self._reports.publish(message)
 
-    def close(self) -> None:
-        """Destroy the topics; idempotent."""
-        self._on_departures.clear()
-        if self._departures is not None:
-            self._departures.close()
-        if self._reports is not None:
-            self._reports.close()
-        self._departures = self._reports = self._process = None
-
     def _is_heard(self) -> bool:
         try:
             return self._reports is not None and self._reports.subscriptions() > 0
