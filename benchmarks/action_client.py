@@ -12,12 +12,11 @@ import resource
 import sys
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from benchmarks.action_server import NAME
-from benchmarks.pipes import Message, answer_lines
+from tests.support.child import serve_commands
 
 __all__ = ["Ours", "Stock"]
 
@@ -156,18 +155,13 @@ class Stock:
 def main() -> None:
     client = Stock() if sys.argv[1] == "stock" else Ours()
 
-    def answer(message: Message) -> Message:
-        if message["do"] == "memory":
-            return {"bytes": resident()}
-        work: Callable[[], int] = lambda: client.goals(  # noqa: E731
-            message["count"], message["at_once"], message["order"]
-        )
+    def goals(**wanted: int) -> dict[str, float]:
         cpu, begin = cpu_seconds(), time.perf_counter()
-        received = work()
+        received = client.goals(**wanted)
         seconds = time.perf_counter() - begin
         return {"seconds": seconds, "cpu": cpu_seconds() - cpu, "received": received}
 
-    answer_lines(answer)
+    serve_commands({"goals": goals, "memory": resident})
     client.close()
 
 

@@ -12,7 +12,7 @@ import threading
 import time
 from typing import Any
 
-from benchmarks.pipes import READY
+from tests.support.child import serve_commands
 
 __all__ = ["NAME", "SLOWLY"]
 
@@ -23,11 +23,6 @@ SLOWLY = 1_000_000
 def plan(order: int) -> tuple[int, float]:
     """Return the number of feedback messages, and the seconds between two."""
     return (order - SLOWLY, 0.01) if order >= SLOWLY else (order, 0.001)
-
-
-def ready() -> None:
-    sys.stdout.buffer.write(READY)
-    sys.stdout.flush()
 
 
 def serve_stock() -> None:
@@ -60,8 +55,7 @@ def serve_stock() -> None:
         result_timeout=10,
     )
     threading.Thread(target=executor.spin, daemon=True).start()
-    ready()
-    sys.stdin.read()
+    serve_commands({})
     rclpy.shutdown()
     del server
 
@@ -81,8 +75,7 @@ async def serve_ours() -> None:
 
     async with rosasync.Session("bench_action_server") as session:
         session.serve_action(Fibonacci, NAME, execute, concurrency=100, result_timeout=10.0)
-        ready()
-        await asyncio.to_thread(sys.stdin.read)
+        await asyncio.to_thread(serve_commands, {})
 
 
 if __name__ == "__main__":

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import statistics
-import subprocess
-import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 from benchmarks.action_server import SLOWLY
 from benchmarks.pages import markdown_table
-from benchmarks.pipes import READY, ROOT, Child, await_line
 from benchmarks.trials import Goal, Trials, check
+from tests.support.child import Child
 
 __all__ = ["COMMAND", "Figure", "goals", "heading", "measure", "row", "section", "total"]
 
@@ -66,7 +65,11 @@ def measure(
     for number in range(rounds):
         for server in SERVERS:
             for client in CLIENTS:
-                with _server(server), Child("benchmarks.action_client", client) as child:
+                with (
+                    _child("action_server", server) as peer,
+                    _child("action_client", client) as child,
+                ):
+                    peer.ask_now("ready")
                     grows = client == OURS and number == rounds - 1
                     for figure in _round(child, client, server, scale, grows):
                         found.append(figure)
@@ -79,7 +82,7 @@ def _round(
 ) -> Iterator[Figure]:
     def ask(count: int, at_once: int, order: int = 0) -> dict[str, float]:
         count = max(at_once, round(count * scale))
-        answer = child.ask("goals", timeout=TIMEOUT, count=count, at_once=at_once, order=order)
+        answer = child.ask_now("goals", patience=TIMEOUT, count=count, at_once=at_once, order=order)
         return {**answer, "count": float(count)}
 
     def one() -> float:
@@ -92,24 +95,24 @@ def _round(
 
     def feedback() -> tuple[float, int]:
         order = round(5000 * scale)
-        answer = child.ask("goals", timeout=TIMEOUT, count=1, at_once=1, order=order)
+        answer = child.ask_now("goals", patience=TIMEOUT, count=1, at_once=1, order=order)
         return 100 * answer["cpu"] / answer["seconds"], order - int(answer["received"])
 
     def beside() -> float:
         # The others have 100 messages a second each, this client's goal has the same.
         order = SLOWLY + round(500 * scale)
-        with Child("benchmarks.action_client", OURS) as others:
-            others.ask("goals", timeout=TIMEOUT, count=1, at_once=1, order=0)
+        with _child("action_client", OURS) as others:
+            others.ask_now("goals", patience=TIMEOUT, count=1, at_once=1, order=0)
             with _asked(others, count=OTHERS, at_once=OTHERS, order=order + 100):
-                answer = child.ask("goals", timeout=TIMEOUT, count=1, at_once=1, order=order)
+                answer = child.ask_now("goals", patience=TIMEOUT, count=1, at_once=1, order=order)
         share: float = 100 * answer["cpu"] / answer["seconds"]
         return share
 
     def growth() -> float:
         ask(1000, 10)
-        before = child.ask("memory", timeout=TIMEOUT)["bytes"]
+        before = child.ask_now("memory")
         ask(9000, 10)
-        grown: float = (child.ask("memory", timeout=TIMEOUT)["bytes"] - before) / 1e6
+        grown: float = (child.ask_now("memory") - before) / 1e6
         return grown
 
     work: dict[str, Callable[[], float | tuple[float, int]]] = {
@@ -203,35 +206,14 @@ def _text(value: float | None) -> str:
     return "never ended" if value is None else f"{value:.3g}"
 
 
-@contextmanager
-def _server(kind: str) -> Iterator[None]:
-    """Run an action server in the block."""
-    with ExitStack() as stack:
-        process = stack.enter_context(
-            subprocess.Popen(
-                (sys.executable, "-m", "benchmarks.action_server", kind),
-                cwd=ROOT,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
-            )
-        )
-        stack.callback(process.kill)
-        assert process.stdout is not None
-        if not await_line(process.stdout, READY):
-            raise RuntimeError(f"the action server of {kind} did not start")
-        yield
-        assert process.stdin is not None
-        process.stdin.close()
-        process.wait(10.0)
+def _child(module: str, kind: str) -> Child:
+    return Child(f"benchmarks.{module}", kind, quiet=True)
 
 
 @contextmanager
 def _asked(child: Child, **message: int) -> Iterator[None]:
     """Let a child work on a message while the block runs."""
-    from concurrent.futures import ThreadPoolExecutor
-
     with ThreadPoolExecutor(1) as pool:
-        future = pool.submit(lambda: child.ask("goals", timeout=TIMEOUT, **message))
+        future = pool.submit(lambda: child.ask_now("goals", patience=TIMEOUT, **message))
         yield
         future.result()

@@ -27,10 +27,10 @@ from rich.table import Table
 import rosasync
 from benchmarks.contestants.base import spinning
 from benchmarks.meter import resident_bytes
-from benchmarks.pipes import Child, answer_lines
 from benchmarks.results import Results
-from benchmarks.server import Server
+from benchmarks.server import Server, WorkServer
 from benchmarks.work import READY_TIMEOUT, Work, load_type, make_request
+from tests.support.child import Child, serve_commands
 
 __all__ = ["allocation_rows", "measure_allocations", "show_allocations"]
 
@@ -160,27 +160,21 @@ class Subject:
         self._stack = ExitStack()
         self._caller: Caller | None = None
 
-    def answer(self, message: dict[str, Any]) -> dict[str, Any]:
-        answer: dict[str, Any] = getattr(self, "do_" + message.pop("do"))(**message)
-        return answer
-
-    def do_setup(self, work: dict[str, Any]) -> dict[str, Any]:
+    def setup(self, work: dict[str, Any]) -> None:
         if self._kind in CALLERS:
             self._caller = CALLERS[self._kind](Work.from_json(work), self._stack)
         else:
             server = Server()
-            server.do_serve({**work, "server": self._kind})
-            self._stack.callback(server.do_end)
-        return {}
+            server.serve({**work, "server": self._kind})
+            self._stack.callback(server.end)
 
-    def do_call(self, calls: int) -> dict[str, Any]:
+    def call(self, calls: int) -> None:
         assert self._caller is not None
         self._caller.call(calls)
-        return {}
 
-    def do_held(self, calls: int) -> dict[str, Any]:
+    def held(self, calls: int) -> Row:
         assert self._caller is not None
-        found: dict[str, Any] = {}
+        found: Row = {}
         with tracing():
             self._caller.hold(calls, lambda: None)
             before = traced()
@@ -193,24 +187,22 @@ class Subject:
             self._caller.hold(calls, look)
         return found
 
-    def do_peak_begin(self) -> dict[str, Any]:
+    def peak_begin(self) -> None:
         tracemalloc.start()
-        return {}
 
-    def do_peak_rest(self) -> dict[str, Any]:
+    def peak_rest(self) -> None:
         gc.collect()
         gc.disable()
         self._resting = tracemalloc.get_traced_memory()[0]
         tracemalloc.reset_peak()
-        return {}
 
-    def do_peak_end(self) -> dict[str, Any]:
+    def peak_end(self) -> int:
         peak = tracemalloc.get_traced_memory()[1] - self._resting
         tracemalloc.stop()
         gc.enable()
-        return {"peak": peak}
+        return peak
 
-    def do_state(self) -> dict[str, Any]:
+    def state(self) -> Row:
         resident = resident_bytes()
         return {
             "resident": resident,
@@ -258,43 +250,42 @@ def measure_allocations(results: Results, *, quick: bool, rounds: int, progress:
 
 
 def _measure_client(kind: str, work: Work, calls: int) -> Row:
-    with Child("benchmarks.server") as server, Child("benchmarks.allocations", kind) as client:
-        server.ask("serve", work=work.to_json(), timeout=READY_TIMEOUT)
-        client.ask("setup", work=work.to_json(), timeout=2 * READY_TIMEOUT)
-        call = partial(client.ask, "call", timeout=PATIENCE)
-        held = client.ask("held", calls=OUT, timeout=PATIENCE)
+    with WorkServer(work), Child("benchmarks.allocations", kind, quiet=True) as client:
+        client.ask_now("setup", work=work.to_json())
+        call = partial(client.ask_now, "call", patience=PATIENCE)
+        held = client.ask_now("held", calls=OUT, patience=PATIENCE)
         return {**held, **_look(client, call, calls)}
 
 
 def _measure_server(kind: str, work: Work, calls: int) -> Row:
     work = Work(srv_name=work.srv_name)
     with (
-        Child("benchmarks.allocations", kind) as server,
-        Child("benchmarks.worker", "floor") as one,
+        Child("benchmarks.allocations", kind, quiet=True) as server,
+        Child("benchmarks.worker", "floor", quiet=True) as one,
     ):
-        server.ask("setup", work=work.to_json(), timeout=READY_TIMEOUT)
-        one.ask("setup", work=work.to_json(), timeout=2 * READY_TIMEOUT)
-        call = partial(one.ask, "call", callers=1, seconds=PATIENCE, timeout=2 * PATIENCE)
+        server.ask_now("setup", work=work.to_json())
+        one.ask_now("setup", work=work.to_json())
+        call = partial(one.ask_now, "call", callers=1, seconds=PATIENCE, patience=2 * PATIENCE)
         found = _look(server, call, calls)
-        one.ask("close", timeout=READY_TIMEOUT)
+        one.ask_now("close")
         return found
 
 
 def _look(subject: Child, call: Callable[..., Any], calls: int) -> Row:
     """Measure the peak of a call, then what stays allocated after many calls."""
-    ask = partial(subject.ask, timeout=PATIENCE)
+    ask = partial(subject.ask_now, patience=PATIENCE)
     call(calls=PEAK_CALLS)
     ask("peak_begin")
     call(calls=PEAK_CALLS)
     ask("peak_rest")
     call(calls=PEAK_CALLS)
-    found: Row = ask("peak_end")
+    peak: float = ask("peak_end")
     call(calls=WARM)
     before = ask("state")
     call(calls=calls - WARM)
     after = ask("state")
     return {
-        **found,
+        "peak": peak,
         "kept_blocks": after["blocks"] - before["blocks"],
         "growth": (after["resident"] - before["resident"]) / 1e6,
         "pending": after["pending"],
@@ -342,7 +333,7 @@ def show_allocations(results: Results) -> Iterator[Table]:
 
 def main() -> None:
     subject = Subject(sys.argv[1])
-    answer_lines(subject.answer)
+    serve_commands(subject)
     subject.close()
 
 

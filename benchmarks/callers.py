@@ -20,8 +20,8 @@ from contextlib import ExitStack
 from typing import Any
 
 from benchmarks.contestants.base import spinning
-from benchmarks.pipes import answer_lines
 from benchmarks.work import READY_TIMEOUT, Work, load_type, make_request
+from tests.support.child import serve_commands
 
 __all__ = ["KINDS", "Callers"]
 
@@ -281,32 +281,24 @@ class Callers:
     def __init__(self, kind: str) -> None:
         self._caller = KINDS[kind]()
 
-    def answer(self, message: dict[str, Any]) -> dict[str, Any]:
-        answer: dict[str, Any] = getattr(self, "do_" + message.pop("do"))(**message)
-        return answer
-
-    def do_setup(self, work: dict[str, Any]) -> dict[str, Any]:
+    def setup(self, work: dict[str, Any]) -> None:
         self._caller.setup(Work.from_json(work))
-        return {}
 
-    def do_offer(
-        self, phases: Phases, timeouts: Timeouts, seed: int, begin: float
-    ) -> dict[str, Any]:
+    def offer(self, phases: Phases, timeouts: Timeouts, seed: int, begin: float) -> dict[str, Any]:
         log = Log(begin)
         self._caller.offer(arrivals(phases, seed), timeouts, log)
         return log.to_json()
 
-    def do_keep(
+    def keep(
         self, callers: int, seconds: float, limit: float | None, begin: float
     ) -> dict[str, Any]:
         log = Log(begin)
         self._caller.keep(callers, seconds, limit, log)
         return log.to_json()
 
-    def do_close(self) -> dict[str, Any]:
+    def close(self) -> None:
         self._caller.close()
-        return {}
 
 
 if __name__ == "__main__":
-    answer_lines(Callers(sys.argv[1]).answer)
+    serve_commands(Callers(sys.argv[1]))

@@ -13,39 +13,41 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.pages import markdown_table
-from benchmarks.pipes import ROOT, await_line
-from benchmarks.stock import StockServer
+from benchmarks.server import WorkServer
 from benchmarks.trials import Trials
+from benchmarks.work import Work
+from tests.support.child import ROOT
 
 __all__ = ["PROGRAMS", "Start", "check_programs", "draw", "heading", "measure", "rows", "section"]
 
 COMMAND = "cold"
-NAME, TYPE = "/bench/cold", "std_srvs/srv/Empty"
+WORK = Work(srv_name="/bench/cold")
+NAME, TYPE = WORK.names[0], WORK.srv_type
 
 ANSWER = b"{}\n"
 """The empty response, as `rosasync call` prints it."""
 
-STOCK = """\
+STOCK = f"""\
 import rclpy
 from std_srvs.srv import Empty
 rclpy.init()
 node = rclpy.create_node("cold")
-client = node.create_client(Empty, "/bench/cold")
+client = node.create_client(Empty, "{NAME}")
 client.wait_for_service()
 future = client.call_async(Empty.Request())
 rclpy.spin_until_future_complete(node, future)
-print("{}", flush=True)
+print("{{}}", flush=True)
 node.destroy_node()
 rclpy.shutdown()
 """
-ROSASYNC = """\
+ROSASYNC = f"""\
 import asyncio
 import rosasync
 from std_srvs.srv import Empty
 async def main():
     async with rosasync.Session("cold", timeout=30.0) as session:
-        await session.call(Empty, "/bench/cold")
-        print("{}", flush=True)
+        await session.call(Empty, "{NAME}")
+        print("{{}}", flush=True)
 asyncio.run(main())
 """
 
@@ -85,7 +87,7 @@ def measure(
 ) -> list[Start]:
     """Start processes in sequence; the programs alternate."""
     starts = []
-    with StockServer(NAME):
+    with WorkServer(WORK):
         for _ in range(processes):
             for program in programs:
                 starts.append(Start(program, _run(PROGRAMS[program])))
@@ -100,7 +102,8 @@ def _run(command: Sequence[str]) -> float | None:
         command, cwd=ROOT, env=os.environ, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
     ) as process:
         assert process.stdout is not None
-        answered = await_line(process.stdout, ANSWER)
+        # Past what the middleware logs.
+        answered = ANSWER in iter(process.stdout.readline, b"")
         seconds = time.monotonic() - begin
         process.stdout.read()
     return seconds if answered and process.returncode == 0 else None

@@ -14,11 +14,11 @@ from matplotlib.figure import Figure
 from rich.progress import Progress
 
 from benchmarks import actions, cold, crash, faults, overload, sharing, status
-from benchmarks.hosts import NoHosts
 from benchmarks.pages import replace_section
 from benchmarks.tables import make_console, make_table
 from benchmarks.trials import Goal, Trials, check
 from rosasync._ros.domain import isolate
+from tests.support.hosts import NoHosts
 
 __all__ = ["add_commands", "save"]
 

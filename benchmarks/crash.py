@@ -20,10 +20,11 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.pages import markdown_table
-from benchmarks.pipes import ROOT
+from benchmarks.server import WorkServer
 from benchmarks.sharing import BEFORE, older
-from benchmarks.stock import StockServer
 from benchmarks.trials import Trials
+from benchmarks.work import Work
+from tests.support.child import ROOT
 
 __all__ = [
     "COMMAND",
@@ -37,7 +38,8 @@ __all__ = [
 ]
 
 COMMAND = "crash"
-NAME = "/bench/crash"
+WORK = Work(srv_name="/bench/crash")
+NAME = WORK.names[0]
 STOCK, RUN, OURS = "stock", "stock with rosasync run", "rosasync"
 CONTESTANTS = (STOCK, BEFORE, OURS, RUN)
 PATIENCE = 60.0
@@ -194,7 +196,7 @@ def _replace_clients(
     contestant: str, restarts: int, environment: Mapping[str, str]
 ) -> Iterator[float | None]:
     program = OUR_CLIENT if contestant in (OURS, BEFORE) else STOCK_CLIENT
-    with StockServer(NAME):
+    with WorkServer(WORK):
         for restart, client in enumerate(_succession(contestant, program, restarts, environment)):
             answer = client.find("answered")
             # The first one has no predecessor.

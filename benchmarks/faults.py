@@ -12,13 +12,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from benchmarks.contestants.base import ANSWERED, LoggedCall
-from benchmarks.lossy import LossyHosts
 from benchmarks.pages import markdown_table
-from benchmarks.pipes import Child
+from benchmarks.server import WorkServer
 from benchmarks.sharing import older
-from benchmarks.stock import StockServer
 from benchmarks.trials import Goal, Trials, check
-from benchmarks.work import READY_TIMEOUT, Work
+from benchmarks.work import Work
+from tests.support.child import Child
+from tests.support.lossy import LossyHosts
 
 __all__ = [
     "SITUATIONS",
@@ -101,23 +101,24 @@ class Bench:
     environment: Mapping[str, str] = field(default_factory=dict)
     _numbers: Iterator[int] = field(default_factory=lambda: itertools.count(1))
 
-    def work(self, timeout: float) -> Work:
-        return Work(srv_name=f"/bench/fault_{next(self._numbers)}", timeout=timeout)
+    def work(self, timeout: float, seconds: float = WORK) -> Work:
+        name = f"/bench/fault_{next(self._numbers)}"
+        return Work(srv_name=name, timeout=timeout, handling=seconds)
 
-    def server(self, work: Work, seconds: float = WORK) -> StockServer:
-        return StockServer(
-            work.names[0], seconds, prefix=self.server_prefix, environment=self.environment
-        )
+    def server(self, work: Work) -> WorkServer:
+        return WorkServer(work, prefix=self.server_prefix, environment=self.environment)
 
     @contextmanager
     def client(self, contestant: str, work: Work) -> Iterator[Child]:
         """Set a contestant up in a process of its own, and end it."""
         key = KEYS.get(contestant, contestant)
         environment = {**self.environment, **(self.older if contestant in KEYS else {})}
-        with Child("benchmarks.worker", key, prefix=self.prefix, environment=environment) as child:
-            child.ask("setup", work=work.to_json(), timeout=READY_TIMEOUT + PATIENCE)
+        with Child(
+            "benchmarks.worker", key, prefix=self.prefix, environment=environment, quiet=True
+        ) as child:
+            child.ask_now("setup", work=work.to_json())
             yield child
-            child.ask("close", timeout=PATIENCE)
+            child.ask_now("close")
 
 
 def plans(
@@ -177,8 +178,8 @@ def _killed(bench: Bench, contestant: str, seconds: float) -> Fault:
     with bench.client(contestant, work) as client, ThreadPoolExecutor(1) as thread:
         log = thread.submit(_log, client, CALLERS, KILL_AFTER + seconds)
         time.sleep(KILL_AFTER)
-        killed = first.kill()
-        first.close()
+        killed = time.monotonic()
+        first.kill()
         time.sleep(NEXT_SERVER)
         began = time.monotonic()
         with bench.server(work):
@@ -204,8 +205,8 @@ def _restarted(bench: Bench, contestant: str, seconds: float) -> Fault:
         until = time.monotonic() + seconds
         while time.monotonic() + RESTART_EVERY < until:
             time.sleep(RESTART_EVERY)
-            restarts.append(server.interrupt())
-            server.close()
+            restarts.append(time.monotonic())
+            server.interrupt()
             server = bench.server(work)
         calls = log.result()
     server.close()
@@ -242,15 +243,14 @@ def _slow(bench: Bench, contestant: str, seconds: float) -> Fault:
     ended: Counter[str] = Counter()
     lost = 0
     for _ in range(SLOW_ROUNDS):
-        work = bench.work(LONG_TIMEOUT)
-        with bench.server(work, SLOW_WORK), bench.client(contestant, work) as client:
+        work = bench.work(LONG_TIMEOUT, SLOW_WORK)
+        with bench.server(work), bench.client(contestant, work) as client:
             if KEYS.get(contestant, contestant) != RETRY:
                 outcomes = _ends(_log(client, PLAIN, 0.001))
                 ended.update(outcomes)
                 lost += sum(outcomes.values()) - outcomes.get(ANSWERED, 0)
                 continue
-            wait = LONG_TIMEOUT + PATIENCE
-            calls = client.ask("beside", plain=PLAIN, retried=RETRIED, timeout=wait)["calls"]
+            calls = client.ask_now("beside", plain=PLAIN, retried=RETRIED)
             ended.update(ANSWERED if answered else "unanswered" for _, answered in calls)
             lost += sum(not retried and not answered for retried, answered in calls)
     return Fault(
@@ -264,10 +264,9 @@ def _slow(bench: Bench, contestant: str, seconds: float) -> Fault:
 
 
 def _log(client: Child, callers: int, seconds: float) -> list[LoggedCall]:
-    answer = client.ask(
-        "log", callers=callers, seconds=seconds, timeout=seconds + LONG_TIMEOUT + PATIENCE
-    )
-    return [LoggedCall(*call) for call in answer["calls"]]
+    patience = seconds + LONG_TIMEOUT + PATIENCE
+    calls = client.ask_now("log", callers=callers, seconds=seconds, patience=patience)
+    return [LoggedCall(*call) for call in calls]
 
 
 def _ends(calls: Iterable[LoggedCall]) -> dict[str, int]:

@@ -18,9 +18,9 @@ from matplotlib.figure import Figure
 from benchmarks.callers import KINDS
 from benchmarks.figures import brief
 from benchmarks.pages import markdown_table
-from benchmarks.pipes import Child
 from benchmarks.trials import Goal, Trials, check
-from benchmarks.work import READY_TIMEOUT, Work
+from benchmarks.work import Work
+from tests.support.child import Child
 
 __all__ = [
     "Cell",
@@ -177,7 +177,7 @@ def measure(
     cells = []
     capacities: dict[tuple[str, float, bool], float] = {}
     numbers = itertools.count(1)
-    with Child("benchmarks.server") as server, ExitStack() as stack:
+    with Child("benchmarks.server", quiet=True) as server, ExitStack() as stack:
         crew = _Crew(stack)
         for plan in chosen:
             key = plan.server, plan.work, plan.exponential
@@ -204,11 +204,11 @@ class _Crew:
         """Yield a process of this kind, with a client for this work."""
         child = self._children.get((kind, number))
         if child is None:
-            child = self._stack.enter_context(Child("benchmarks.callers", kind))
+            child = self._stack.enter_context(Child("benchmarks.callers", kind, quiet=True))
             self._children[kind, number] = child
-        child.ask("setup", work=work, timeout=READY_TIMEOUT + PATIENCE)
+        child.ask_now("setup", work=work)
         yield child
-        child.ask("close", timeout=PATIENCE)
+        child.ask_now("close")
 
 
 @contextmanager
@@ -219,12 +219,12 @@ def _served(plan: Plan, server: Child, name: str) -> Iterator[dict[str, Any]]:
         server=SERVERS[plan.server],
         srv_name=name,
     ).to_json()
-    server.ask("serve", work=work, timeout=READY_TIMEOUT)
+    server.ask_now("serve", work=work)
     try:
         yield work
     finally:
         # A rosasync server finishes what waits, for a few seconds.
-        server.ask("end", timeout=PATIENCE)
+        server.ask_now("end")
 
 
 def _calibrate(plan: Plan, server: Child, crew: _Crew, name: str) -> float:
@@ -232,7 +232,7 @@ def _calibrate(plan: Plan, server: Child, crew: _Crew, name: str) -> float:
     with _served(plan, server, name) as work, crew.ready("stock", 0, work) as caller:
         run = {"callers": KEPT, "seconds": CALIBRATION, "limit": 10.0}
         begin = time.monotonic() + LEAD
-        found = caller.ask("keep", begin=begin, timeout=PATIENCE, **run)
+        found = caller.ask_now("keep", begin=begin, **run)
         return len(found["calls"]) / CALIBRATION
 
 
@@ -252,23 +252,23 @@ def _measure(
         children = [ready(plan.client, number) for number in range(plan.processes)]
         flood = ready("stock", plan.processes) if plan.kind == "polite" else None
         pool = stack.enter_context(ThreadPoolExecutor(len(children) + 1))
-        before = server.ask("handled", timeout=PATIENCE)["requests"]
+        before = server.ask_now("handled")
         begin = time.monotonic() + LEAD
-        timeout = LEAD + 2 * seconds + PATIENCE
+        patience = LEAD + 2 * seconds + PATIENCE
         if flood is not None:
             kept = {"callers": FLOOD, "seconds": seconds + LEAD, "limit": 2.0, "begin": begin}
-            flooding = pool.submit(flood.ask, "keep", timeout=timeout, **kept)
+            flooding = pool.submit(flood.ask_now, "keep", patience=patience, **kept)
             begin += LEAD
         messages = [
             _message(plan, capacity, seconds, begin, seed) for seed in range(plan.processes)
         ]
         asked = [
-            pool.submit(child.ask, message.pop("do"), timeout=timeout, **message)
+            pool.submit(child.ask_now, message.pop("do"), patience=patience, **message)
             for child, message in zip(children, messages, strict=True)
         ]
         # What was served when the last calls may still be answered.
         time.sleep(max(0.0, begin + _duration(plan, seconds) - time.monotonic()))
-        served = server.ask("handled", timeout=PATIENCE)["requests"] - before
+        served = server.ask_now("handled") - before
         found = [future.result() for future in asked]
         if flood is not None:
             flooding.result()

@@ -20,7 +20,7 @@ from rich.table import Table
 
 import rosasync
 from benchmarks.pages import replace_section
-from benchmarks.pipes import Child
+from benchmarks.server import WorkServer
 from benchmarks.work import CALL_TIMEOUT, READY_TIMEOUT, Work, load_type, make_request
 
 __all__ = ["STAGES", "Profile", "Stage", "profile", "table", "updated"]
@@ -28,7 +28,6 @@ __all__ = ["STAGES", "Profile", "Stage", "profile", "table", "updated"]
 T = TypeVar("T")
 Args = TypeVarTuple("Args")
 
-PATIENCE = 10.0
 WARM_UP = 500
 ROUND = 250
 """Calls with and without timestamps alternate in rounds of this many calls."""
@@ -195,12 +194,8 @@ def profile(calls: int) -> Profile:
     """Measure calls, one at a time, on asyncio and the direct bridge, to a bare server."""
     work = Work(server="lean", srv_name="/bench/profile")
     loop_factory = StampedLoop()
-    server = Child("benchmarks.server")
-    with server, asyncio.Runner(loop_factory=loop_factory) as runner:
-        server.ask("serve", work=work.to_json(), timeout=READY_TIMEOUT)
-        found = runner.run(_measure(work, calls, loop_factory.stamps))
-        server.ask("end", timeout=PATIENCE)
-    return found
+    with WorkServer(work), asyncio.Runner(loop_factory=loop_factory) as runner:
+        return runner.run(_measure(work, calls, loop_factory.stamps))
 
 
 async def _measure(work: Work, calls: int, stamps: Stamps) -> Profile:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from types import TracebackType
@@ -13,11 +13,12 @@ from typing import Any, Literal
 
 from rich.progress import Progress
 
-from benchmarks.hosts import Hosts, NoHosts
 from benchmarks.meter import Usage
-from benchmarks.pipes import Child, ChildError, Hung
 from benchmarks.results import Results, Turn
-from benchmarks.work import READY_TIMEOUT, Work
+from benchmarks.work import Work
+from tests.support.child import Child, ChildError, Unanswered
+from tests.support.flood import flooding
+from tests.support.hosts import Hosts, NoHosts
 
 __all__ = ["Runner", "Scenario"]
 
@@ -132,10 +133,10 @@ class Runner:
         turn = Turn(scenario.key, contestant, number, "ok")
         try:
             measured = self._measure(scenario, contestant)
-        except Hung as exc:
+        except Unanswered as exc:
             self._hung[scenario.key, contestant] += 1
             turn = dataclasses.replace(turn, outcome="hung", error=str(exc))
-            self._end(scenario.host, contestant, kill=True)
+            self._end(scenario.host, contestant)
         except ChildError as exc:
             turn = dataclasses.replace(turn, outcome="failed", error=str(exc))
             self._end(scenario.host, contestant)
@@ -146,42 +147,40 @@ class Runner:
     def _measure(self, scenario: Scenario, contestant: str) -> dict[str, Any]:
         self._turns += 1
         name = f"/bench/turn_{self._turns}"
-        work = dataclasses.replace(scenario.work, srv_name=name).to_json()
+        work = dataclasses.replace(scenario.work, srv_name=name)
         patience = PATIENCE + scenario.seconds
         server, worker = self._server(scenario.host), self._worker(scenario, contestant)
-        if scenario.work.server != "inside":
-            server.ask("serve", work=work, timeout=READY_TIMEOUT)
-        worker.ask("setup", work=work, timeout=READY_TIMEOUT + PATIENCE)
-        if scenario.flood:
-            flood = self._child(scenario.host, "benchmarks.flood")
-            flood.ask("start", work=work, callers=scenario.flood, timeout=READY_TIMEOUT)
-        elif scenario.action == "call":
-            warm_up = {"calls": max(10 * scenario.callers, scenario.calls // 10), "seconds": 1.0}
-            worker.ask("call", callers=scenario.callers, timeout=patience, **warm_up)
-        before = Usage(**server.ask("usage", timeout=PATIENCE))
-        measured = self._act(scenario, worker, patience)
-        after = Usage(**server.ask("usage", timeout=PATIENCE))
-        if scenario.flood:
-            flood.ask("stop", timeout=PATIENCE)
-        worker.ask("close", timeout=PATIENCE)
-        if scenario.work.server != "inside":
-            server.ask("end", timeout=PATIENCE)
+        if work.server != "inside":
+            server.ask_now("serve", work=work.to_json())
+        worker.ask_now("setup", work=work.to_json())
+        with ExitStack() as stack:
+            if scenario.flood:
+                options = self._options(scenario.host, on_server=False)
+                flood = flooding(work.names[0], work.srv_type, scenario.flood, **options)
+                stack.enter_context(flood)
+            elif scenario.action == "call":
+                calls = max(10 * scenario.callers, scenario.calls // 10)
+                self._act(dataclasses.replace(scenario, calls=calls, seconds=1.0), worker, patience)
+            before = Usage(**server.ask_now("usage", patience=PATIENCE))
+            measured = self._act(scenario, worker, patience)
+            after = Usage(**server.ask_now("usage", patience=PATIENCE))
+        worker.ask_now("close", patience=PATIENCE)
+        if work.server != "inside":
+            server.ask_now("end", patience=PATIENCE)
             measured["server"] = after - before
         return measured
 
     def _act(self, scenario: Scenario, worker: Child, patience: float) -> dict[str, Any]:
+        wanted: dict[str, Any] = {"calls": scenario.calls, "seconds": scenario.seconds}
         if scenario.action == "soak":
-            answer = worker.ask("soak", timeout=SOAK_TIMEOUT)
-            answer["memory"] = tuple(answer["memory"])
+            wanted, patience = {}, SOAK_TIMEOUT
         elif scenario.action == "rest":
-            answer = worker.ask("rest", seconds=scenario.seconds, timeout=patience)
+            del wanted["calls"]
         elif scenario.action == "tick":
-            wanted = {"calls": scenario.calls, "seconds": scenario.seconds}
-            tree = {"measure": scenario.measure, "leaves": scenario.callers}
-            answer = worker.ask("tick", timeout=patience, **tree, **wanted)
+            wanted |= {"measure": scenario.measure, "leaves": scenario.callers}
         else:
-            wanted = {"calls": scenario.calls, "seconds": scenario.seconds}
-            answer = worker.ask("call", callers=scenario.callers, timeout=patience, **wanted)
+            wanted["callers"] = scenario.callers
+        answer = worker.ask_now(scenario.action, patience=patience, **wanted)
         return {**answer, "client": Usage(**answer["client"])}
 
     def _server(self, host: str) -> Child:
@@ -197,25 +196,25 @@ class Runner:
     def _child(self, host: str, module: str, *args: str) -> Child:
         key = (host, args[0] if args else module)
         if key not in self._children:
-            on_server = module == "benchmarks.server"
-            prefix: Sequence[str] = ()
-            environment: Mapping[str, str] = {}
-            if host == "other":
-                assert self._hosts is not None
-                prefix = self._hosts.on_server if on_server else self._hosts.on_client
-                environment = self._hosts.environment
-            cores = self._server_cores if on_server else self._worker_cores
-            self._children[key] = Child(
-                module, *args, cores=cores, prefix=prefix, environment=environment
-            )
+            options = self._options(host, on_server=module == "benchmarks.server")
+            self._children[key] = Child(module, *args, **options)
         return self._children[key]
 
-    def _end(self, host: str, contestant: str, *, kill: bool = False) -> None:
-        """End the processes of a failed turn."""
-        for name in (contestant, "benchmarks.server", "benchmarks.flood"):
-            child = self._children.pop((host, name), None)
-            if child is not None:
-                child.kill() if kill and name == contestant else child.close()
+    def _options(self, host: str, *, on_server: bool) -> dict[str, Any]:
+        options: dict[str, Any] = {"quiet": True}
+        options["cores"] = self._server_cores if on_server else self._worker_cores
+        if host == "other":
+            assert self._hosts is not None
+            options["prefix"] = self._hosts.on_server if on_server else self._hosts.on_client
+            options["environment"] = self._hosts.environment
+        return options
+
+    def _end(self, host: str, contestant: str) -> None:
+        """End the processes of a failed turn; one that hung is dead already."""
+        for name in (contestant, "benchmarks.server"):
+            if (child := self._children.pop((host, name), None)) is not None:
+                with child:
+                    pass
 
 
 def split_cores() -> tuple[set[int] | None, set[int] | None]:

@@ -1,4 +1,4 @@
-"""The server process of the benchmarks, controlled by the runner: stock rclpy or a bare loop.
+"""The server process of the benchmarks: stock rclpy, a bare loop or rosasync.
 
 Services are created and destroyed with each turn, so that the server has nothing else to do.
 """
@@ -6,14 +6,16 @@ Services are created and destroyed with each turn, so that the server has nothin
 from __future__ import annotations
 
 import ctypes
+import dataclasses
 import heapq
 import os
 import select
+import signal
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
 
 import rclpy
@@ -22,11 +24,21 @@ from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 
 from benchmarks.contestants.base import spinning
 from benchmarks.meter import usage
-from benchmarks.pipes import answer_lines
-from benchmarks.servers import LIMITED, SERVERS, async_handler, rosasync_server
-from benchmarks.stopped import stopping_server
-from benchmarks.work import Work, handled, load_type, make_handler, make_qos, make_response
+from benchmarks.work import (
+    Work,
+    async_handler,
+    handled,
+    load_type,
+    make_handler,
+    make_qos,
+    make_response,
+)
+from tests.support.child import Child, serve_commands
 
+__all__ = ["Server", "WorkServer"]
+
+PR_SET_PDEATHSIG = 1
+"""From ``sys/prctl.h``: the signal that a process gets when its parent dies."""
 LEAN_DEPTH = 1000
 WAIT_SET_LIMIT = 16
 """With more services, building the wait set would be most of the server's work."""
@@ -165,35 +177,32 @@ def signal_requests(service: Any, fd: int | None) -> None:
 
 
 class Server:
-    """Answers the runner's requests: ``serve``, ``usage`` and ``end``."""
+    """Answers the runner's requests. Its methods are the commands."""
 
     def __init__(self) -> None:
         self._stack = ExitStack()
 
-    def answer(self, message: dict[str, Any]) -> dict[str, Any]:
-        answer: dict[str, Any] = getattr(self, "do_" + message.pop("do"))(**message)
-        return answer
-
-    def do_serve(self, work: dict[str, Any]) -> dict[str, Any]:
+    def serve(self, work: dict[str, Any]) -> None:
         self._serve(Work.from_json(work))
-        return {}
 
-    def do_handled(self) -> dict[str, Any]:
+    def handled(self) -> int:
         """How many requests the handlers that take time have finished, in all turns."""
-        return {"requests": handled["requests"]}
+        return handled["requests"]
 
-    def do_usage(self) -> dict[str, Any]:
+    def usage(self) -> dict[str, Any]:
         return usage().to_json()
 
-    def do_end(self) -> dict[str, Any]:
+    def end(self) -> None:
         self._stack.close()
-        return {}
 
     def _serve(self, work: Work) -> None:
         if work.server == "stopped":
             self._stack.enter_context(stopping_server(work))
             return
-        if work.server in (SERVERS | LIMITED):
+        if work.server not in STOCK:
+            # Only now: a stock server's process has nothing of rosasync.
+            from benchmarks.servers import rosasync_server
+
             self._stack.enter_context(rosasync_server(work))
             return
         rclpy.init()
@@ -206,13 +215,68 @@ class Server:
         if any(work.delays):
             raise ValueError("the stock server answers at once: a delay would block its executor")
         srv_type, qos = load_type(work.srv_type), make_qos(work.depth)
-        handler = (async_handler if work.server == "stock-async" else make_handler)(work)
+        handler = STOCK[work.server](work)
         for name in work.names:
             node.create_service(srv_type, name, handler, qos_profile=qos)
         self._stack.enter_context(spinning(node, SingleThreadedExecutor()))
 
 
-if __name__ == "__main__":
+def make_stopping_handler(work: Work) -> Callable[[Any, Any], Any]:
+    """Return a handler that stops the process as the first request comes.
+
+    To its clients it is dead: nothing takes their requests or acknowledges them. Unlike one that
+    was killed, it can be woken and closed, and so leaves no shared memory behind.
+    """
+    # A stopped process does not see that its standard input has ended: it dies with its parent.
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    stops = iter((True,))
+
+    def stop(_request: Any, response: Any) -> Any:
+        if next(stops, False):
+            os.kill(os.getpid(), signal.SIGSTOP)
+        return response
+
+    return stop
+
+
+STOCK: Mapping[str, Callable[[Work], Callable[[Any, Any], Any]]] = {
+    "stock": make_handler,
+    "stock-async": async_handler,
+    "stopping": make_stopping_handler,
+    "lean": make_handler,
+}
+"""The servers without rosasync, with what makes the handler of each."""
+
+
+@contextmanager
+def stopping_server(work: Work) -> Iterator[None]:
+    """Serve `work` in a process of its own, which stops as the first request comes."""
+    with WorkServer(dataclasses.replace(work, server="stopping")) as server:
+        yield
+        server.signal(signal.SIGCONT)
+
+
+class WorkServer(Child):
+    """The parent's side of such a process that serves one work, and does so once this returns.
+
+    Args:
+        work: what to serve.
+        options: those of `Child`.
+    """
+
+    def __init__(self, work: Work, **options: Any) -> None:
+        super().__init__("benchmarks.server", quiet=True, **options)
+        self.ask_now("serve", work=work.to_json())
+
+
+def main() -> None:
+    # A shell that starts the benchmarks in the background ignores SIGINT, and children inherit it.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     server = Server()
-    answer_lines(server.answer)
-    server.do_end()
+    with suppress(KeyboardInterrupt):
+        serve_commands(server)
+    server.end()
+
+
+if __name__ == "__main__":
+    main()

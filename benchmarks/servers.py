@@ -1,4 +1,4 @@
-"""More servers: stock rclpy with an async handler, and rosasync with each kind of handler."""
+"""rosasync's servers, with each kind of handler."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ import uvloop
 
 import rosasync
 from benchmarks.work import (
+    LIMITED,
+    SERVERS,
     Work,
+    async_handler,
     handled,
     handling_time,
     load_type,
@@ -21,17 +24,7 @@ from benchmarks.work import (
     make_response,
 )
 
-__all__ = ["LIMITED", "SERVERS", "async_handler", "rosasync_server"]
-
-
-def async_handler(work: Work) -> Callable[[Any, Any], Any]:
-    """Return the handler of `make_handler` as a coroutine function."""
-    plain = make_handler(work)
-
-    async def handler(request: Any, response: Any) -> Any:
-        return plain(request, response)
-
-    return handler
+__all__ = ["rosasync_server"]
 
 
 def waiting_handler(work: Work) -> Callable[[Any, Any], Any]:
@@ -90,14 +83,3 @@ async def _serve(
         for server in servers:
             # Without the requests that wait, which may be a thousand.
             await server.aclose(0)
-
-
-SERVERS = {
-    "rosasync": "direct, async",
-    "rosasync-uvloop": "direct, async, uvloop",
-    "rosasync-plain": "direct, plain",
-    "rosasync-executor": "executor, async",
-}
-"""The bridge, handler and loop of each server."""
-LIMITED = {"rosasync-one": "direct, async, one at a time"}
-"""A server for the benchmark of overload alone."""

@@ -22,9 +22,11 @@ from matplotlib.figure import Figure
 from benchmarks.contestants import CONTESTANTS
 from benchmarks.figures import brief
 from benchmarks.pages import markdown_table
-from benchmarks.pipes import ROOT, Child
 from benchmarks.trials import Goal, Trials, check
-from benchmarks.work import READY_TIMEOUT, Work
+from benchmarks.work import Work
+from tests.support.child import ROOT, Child
+from tests.support.flood import CALLERS as FLOODERS
+from tests.support.flood import flooding
 
 __all__ = [
     "Cell",
@@ -46,8 +48,6 @@ USUAL = "direct,direct-retry,semaphore,call,afor-qos"
 BEFORE = "before"
 """The name of the contestant that is rosasync from another checkout."""
 STOCK_DEPTH = 10
-FLOODERS = 8
-"""Requests that the flooder keeps outstanding."""
 LEAD = 0.5
 """Seconds from the last match to the common start."""
 PATIENCE = 15.0
@@ -170,7 +170,7 @@ def measure(
     """Measure the cells one after the other; the processes of a contestant are used again."""
     cells = []
     numbers = itertools.count(1)
-    with older(before) as environment, Child("benchmarks.server") as server:
+    with older(before) as environment, Child("benchmarks.server", quiet=True) as server:
         for contestant, group in itertools.groupby(chosen, key=lambda plan: plan.contestant):
             todo = list(group)
             most = max(plan.processes for plan in todo)
@@ -187,7 +187,7 @@ def measure(
 
 def _crew(stack: ExitStack, key: str, size: int, environment: Mapping[str, str]) -> list[Child]:
     return [
-        stack.enter_context(Child("benchmarks.worker", key, environment=environment))
+        stack.enter_context(Child("benchmarks.worker", key, environment=environment, quiet=True))
         for _ in range(size)
     ]
 
@@ -195,24 +195,22 @@ def _crew(stack: ExitStack, key: str, size: int, environment: Mapping[str, str])
 def _measure(
     plan: Plan, server: Child, crew: Sequence[Child], name: str, callers: int, seconds: float
 ) -> Cell:
-    work = Work(handling=plan.work / 1000, srv_name=name).to_json()
-    server.ask("serve", work=work, timeout=READY_TIMEOUT)
+    work = Work(handling=plan.work / 1000, srv_name=name)
+    server.ask_now("serve", work=work.to_json())
     with ThreadPoolExecutor(len(crew)) as pool, ExitStack() as stack:
 
-        def ask(do: str, timeout: float, **message: Any) -> list[dict[str, Any]]:
-            return list(pool.map(lambda child: child.ask(do, timeout=timeout, **message), crew))
+        def ask(do: str, **message: Any) -> list[Any]:
+            return list(pool.map(lambda child: child.ask_now(do, **message), crew))
 
-        ask("setup", READY_TIMEOUT + PATIENCE, work=work)
+        ask("setup", work=work.to_json())
         if plan.flooded:
-            flood = stack.enter_context(Child("benchmarks.flood"))
-            flood.ask("start", work=work, callers=FLOODERS, timeout=READY_TIMEOUT + PATIENCE)
+            stack.enter_context(flooding(work.names[0], work.srv_type, quiet=True))
         begin = time.monotonic() + LEAD
         wanted = {"callers": callers, "calls": NEVER, "seconds": seconds, "begin": begin}
-        tallies = ask("call", LEAD + seconds + PATIENCE, **wanted)
-        if plan.flooded:
-            flood.ask("stop", timeout=PATIENCE)
-        ask("close", PATIENCE)
-    server.ask("end", timeout=PATIENCE)
+        tallies = ask("call", patience=LEAD + seconds + PATIENCE, **wanted)
+        stack.close()
+        ask("close")
+    server.ask_now("end")
     return _cell(plan, seconds, tallies)
 
 

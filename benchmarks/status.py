@@ -6,18 +6,15 @@
 from __future__ import annotations
 
 import asyncio
-import os
 import statistics
-import subprocess
-import sys
 import time
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 from std_srvs.srv import SetBool
 
 import rosasync
+from tests.support.child import Child, serve_commands
 
 __all__ = ["TARGET", "measure", "rows"]
 
@@ -33,19 +30,8 @@ def measure(calls: int) -> dict[str, list[float]]:
     Returns:
         For each kind, the seconds from the handler's end to the caller's resumption.
     """
-    child = subprocess.Popen(
-        [sys.executable, "-m", "benchmarks.status"],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        cwd=Path(__file__).parent.parent,
-    )
-    try:
+    with Child("benchmarks.status", quiet=True):
         return asyncio.run(_call(calls))
-    finally:
-        assert child.stdin is not None
-        child.stdin.close()
-        child.wait(PATIENCE)
 
 
 def rows(found: dict[str, list[float]]) -> Iterable[list[str]]:
@@ -91,7 +77,7 @@ async def _serve() -> None:
 
     async with rosasync.Session("status_bench_server") as session:
         session.serve(SetBool, NAME, handler, status=True)
-        await asyncio.to_thread(os.read, 0, 1)
+        await asyncio.to_thread(serve_commands, {})
 
 
 if __name__ == "__main__":

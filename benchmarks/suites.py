@@ -9,10 +9,9 @@ from functools import partial
 
 from benchmarks.contestants import CONTESTANTS
 from benchmarks.runner import Scenario
-from benchmarks.servers import SERVERS
 from benchmarks.targets import PEERS, TARGETS
 from benchmarks.ticks import make_ticks
-from benchmarks.work import Work
+from benchmarks.work import SERVERS, Work
 
 __all__ = ["SUITES", "make_suite"]
 

@@ -12,9 +12,9 @@ from rich.table import Table
 
 from benchmarks.figures import METRICS, brief, figure, pooled_percentile, ratio
 from benchmarks.results import Results, Turn
-from benchmarks.servers import SERVERS
 from benchmarks.targets import judge
 from benchmarks.ticks import describe_ticks
+from benchmarks.work import SERVERS
 
 __all__ = ["describe", "make_console", "make_table", "rows", "scenario_table", "target_table"]
 

@@ -11,14 +11,14 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from benchmarks.stock import StockServer
+from benchmarks.server import WorkServer
 from benchmarks.work import Work, load_type
 from rosasync import CallError, Limits, Session
 
 __all__ = ["Moment", "Story", "draw", "follow"]
 
-NAME = "/bench/window"
-HANDLING = 0.001
+WORK = Work(srv_name="/bench/window", handling=0.001)
+NAME = WORK.names[0]
 CALLERS = 16
 TIMEOUT = 1.0
 EVERY = 0.02
@@ -54,10 +54,10 @@ async def follow(pause: float) -> Story:
     Args:
         pause: seconds between two events.
     """
-    srv_type = load_type(Work().srv_type)
+    srv_type = load_type(WORK.srv_type)
     story = Story([], [])
     async with AsyncExitStack() as stack:
-        server = StockServer(NAME, HANDLING)
+        server = WorkServer(WORK)
         stack.callback(lambda: server.close())
         session = await stack.enter_async_context(
             Session("bench_window", limits=Limits(grace=TIMEOUT))
@@ -99,10 +99,7 @@ async def follow(pause: float) -> Story:
                 "they leave", lambda: asyncio.gather(*(o.aclose() for o in (second, *others)))
             )
             await event("server killed", lambda: asyncio.to_thread(server.kill))
-            server.close()
-            server = await event(
-                "another starts", lambda: asyncio.to_thread(StockServer, NAME, HANDLING)
-            )
+            server = await event("another starts", lambda: asyncio.to_thread(WorkServer, WORK))
             await asyncio.sleep(pause)
             for task in tasks:
                 task.cancel()

@@ -14,8 +14,11 @@ from typing import Any
 
 __all__ = [
     "CALL_TIMEOUT",
+    "LIMITED",
     "READY_TIMEOUT",
+    "SERVERS",
     "Work",
+    "async_handler",
     "handled",
     "handling_time",
     "load_type",
@@ -31,6 +34,15 @@ CALL_TIMEOUT = 2.0
 READY_TIMEOUT = 30.0
 """Seconds that a contestant may take to find its servers."""
 
+SERVERS = {
+    "rosasync": "direct, async",
+    "rosasync-uvloop": "direct, async, uvloop",
+    "rosasync-plain": "direct, plain",
+    "rosasync-executor": "executor, async",
+}
+"""The bridge, handler and loop of each server of rosasync."""
+LIMITED = {"rosasync-one": "direct, async, one at a time"}
+"""A server for the benchmark of overload alone."""
 
 handled: Counter[str] = Counter()
 """Counts the requests that handlers with `Work.handling` of this process have finished."""
@@ -50,7 +62,7 @@ class Work:
         server: ``stock``, an rclpy service on a SingleThreadedExecutor; ``lean``, a bare loop that
             is not the bottleneck; ``inside``, created by the contestant in its own process;
             ``stock-async``, stock with an async handler; ``stopped``, stock, and stopped by its
-            first request; or one of `benchmarks.servers`.
+            first request; or one of `SERVERS` or `LIMITED`.
         handling: seconds for which a stock server's callback runs.
         exponential: whether that is a mean, of exponentially distributed times.
         busy: seconds at a time for which the contestant's thread handles no responses.
@@ -121,6 +133,16 @@ def make_handler(work: Work) -> Callable[[Any, Any], Any]:
         return prepared
 
     return handle
+
+
+def async_handler(work: Work) -> Callable[[Any, Any], Any]:
+    """Return the handler of `make_handler` as a coroutine function."""
+    plain = make_handler(work)
+
+    async def handler(request: Any, response: Any) -> Any:
+        return plain(request, response)
+
+    return handler
 
 
 def handling_time(work: Work) -> float:

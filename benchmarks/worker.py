@@ -8,11 +8,11 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, cast
 
 from benchmarks.contestants import Contestant, Tally, make_contestant
-from benchmarks.contestants.base import Logging, Mixing, Soaking
+from benchmarks.contestants.base import LoggedCall, Logging, Mixing, Soaking
 from benchmarks.meter import Usage, resident_bytes, usage
-from benchmarks.pipes import answer_lines
 from benchmarks.ticking import Ticking
 from benchmarks.work import Work
+from tests.support.child import serve_commands
 
 MARGIN = 0.5
 """Seconds at the start and at the end of a rest that are not measured."""
@@ -24,15 +24,10 @@ class Worker:
     def __init__(self, key: str) -> None:
         self._contestant: Contestant = make_contestant(key)
 
-    def answer(self, message: dict[str, Any]) -> dict[str, Any]:
-        answer: dict[str, Any] = getattr(self, "do_" + message.pop("do"))(**message)
-        return answer
-
-    def do_setup(self, work: dict[str, Any]) -> dict[str, Any]:
+    def setup(self, work: dict[str, Any]) -> None:
         self._contestant.setup(Work.from_json(work))
-        return {}
 
-    def do_call(
+    def call(
         self, callers: int, calls: int, seconds: float, begin: float | None = None
     ) -> dict[str, Any]:
         """Call, from a time on the monotonic clock on if one is given."""
@@ -45,21 +40,21 @@ class Worker:
             tally = self._contestant.at_once(callers, calls, seconds)
         return _result(tally, usage() - before)
 
-    def do_log(self, callers: int, seconds: float) -> dict[str, Any]:
+    def log(self, callers: int, seconds: float) -> list[LoggedCall]:
         """Call, and answer with every single call."""
-        return {"calls": cast(Logging, self._contestant).logged(callers, seconds)}
+        return cast(Logging, self._contestant).logged(callers, seconds)
 
-    def do_beside(self, plain: int, retried: int) -> dict[str, Any]:
-        return {"calls": cast(Mixing, self._contestant).beside(plain, retried)}
+    def beside(self, plain: int, retried: int) -> list[tuple[bool, bool]]:
+        return cast(Mixing, self._contestant).beside(plain, retried)
 
-    def do_rest(self, seconds: float) -> dict[str, Any]:
+    def rest(self, seconds: float) -> dict[str, Any]:
         """Rest, and measure without the first and the last moments."""
         with ThreadPoolExecutor(1) as thread:
             used = thread.submit(_usage_within, seconds)
             self._contestant.rest(seconds + 2 * MARGIN)
             return _result(Tally(elapsed=round(seconds * 1e9)), used.result())
 
-    def do_soak(self) -> dict[str, Any]:
+    def soak(self) -> dict[str, Any]:
         before, done = usage(), 0
         tally, memory = Tally(), []
         for calls in SOAK_STATES:
@@ -68,14 +63,13 @@ class Worker:
             memory.append(resident_bytes())
         return {**_result(tally, usage() - before), "memory": memory}
 
-    def do_tick(self, measure: str, leaves: int, calls: int, seconds: float) -> dict[str, Any]:
+    def tick(self, measure: str, leaves: int, calls: int, seconds: float) -> dict[str, Any]:
         before = usage()
         tally = cast(Ticking, self._contestant).tick(measure, leaves, calls, seconds)
         return {**_result(tally, usage() - before), "added": tally.added}
 
-    def do_close(self) -> dict[str, Any]:
+    def close(self) -> None:
         self._contestant.close()
-        return {}
 
 
 def _usage_within(seconds: float) -> Usage:
@@ -97,4 +91,4 @@ def _result(tally: Tally, used: Usage) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    answer_lines(Worker(sys.argv[1]).answer)
+    serve_commands(Worker(sys.argv[1]))

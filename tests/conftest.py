@@ -22,8 +22,8 @@ from rosasync._ros.domain import isolate
 from rosasync._ros.shared_memory import unfinished_ports
 from tests.faults.table import pytest_terminal_summary
 from tests.support.action_servers import ActionServerProcess
+from tests.support.child import Unanswered
 from tests.support.clients import ClientProcess
-from tests.support.process import Unanswered
 from tests.support.servers import ServerProcess
 from tests.support.times import LIMIT
 

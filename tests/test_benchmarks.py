@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import io
 import json
 import subprocess
 import sys
@@ -19,7 +18,6 @@ from benchmarks import (
     commands,
     crash,
     faults,
-    hosts,
     overload,
     pages,
     profile,
@@ -29,7 +27,6 @@ from benchmarks import (
 from benchmarks.contestants import CONTESTANTS, make_contestant
 from benchmarks.contestants.base import LoggedCall
 from benchmarks.meter import Usage
-from benchmarks.pipes import READY, ROOT, await_line
 from benchmarks.report import write_report
 from benchmarks.results import Results, Turn
 from benchmarks.runner import Scenario
@@ -37,6 +34,8 @@ from benchmarks.suites import SUITES, make_suite
 from benchmarks.tables import rows
 from benchmarks.targets import PEERS, TARGETS, judge
 from benchmarks.trials import Trials
+from tests.support import hosts
+from tests.support.child import ROOT
 
 MACHINE = {"cpu": "a CPU", "cores": 2, "load": 0.0, "kernel": "6", "python": "3", "middleware": "m"}
 SETTINGS = {"rounds": 2, "quick": True, "pin": False}
@@ -323,14 +322,6 @@ def test_a_report_opens_with_its_conclusions(tmp_path: Path) -> None:
     assert page.startswith(f"# Benchmarks\n\n{said} `client.call`.\n")
     assert page.index("diagrams/benchmark.svg") < page.index("## Method") < page.index("## Machine")
     assert (tmp_path / "diagrams" / "benchmark.svg").exists()
-
-
-def test_a_process_is_ready_at_its_own_line() -> None:
-    logged = b"2026-01-01 [RTPS_TRANSPORT_SHM Error] Failed init_port\n"
-    output = io.BytesIO(logged + READY + b"next\n")
-    assert await_line(output, READY)
-    assert output.read() == b"next\n"
-    assert not await_line(io.BytesIO(logged), READY)
 
 
 SMALL_RUNS = {

@@ -1,4 +1,4 @@
-"""benchmarks.lossy: the hosts reach each other, lose packets as told, and leave nothing behind."""
+"""Lossy hosts: they reach each other, lose packets as told, and leave nothing behind."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.hosts import NoHosts
-from benchmarks.lossy import LossyHosts
+from tests.support.hosts import NoHosts
+from tests.support.lossy import LossyHosts
 from tests.support.process import ended
 
 PACKETS = 400

@@ -14,9 +14,9 @@ from xml.etree import ElementTree
 
 import pytest
 
-from benchmarks.hosts import NoHosts
-from benchmarks.lossy import LossyHosts
 from rosasync._ros import configuration, fastdds, profile
+from tests.support.hosts import NoHosts
+from tests.support.lossy import LossyHosts
 from tests.support.process import first_line, own
 from tests.support.program import as_root, own_shared_memory
 from tests.support.times import LIMIT, TICK, until

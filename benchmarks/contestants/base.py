@@ -12,8 +12,8 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
-from benchmarks.pipes import describe
 from benchmarks.work import READY_TIMEOUT, Work, load_type, make_handler, make_qos
+from tests.support.child import describe
 
 __all__ = [
     "ANSWERED",

@@ -11,8 +11,9 @@ from typing import Any
 from rosasync import Limits, Session
 from tests.faults.table import Row
 from tests.faults.trial import PATIENT, Trial, resident_megabytes
+from tests.support.child import serve_commands
 from tests.support.echo import ECHO, service_class
-from tests.support.process import Child, serve_commands
+from tests.support.process import NodeProcess
 from tests.support.times import LIMIT, TICK, until
 
 __all__ = ["CallerProcess"]
@@ -20,7 +21,7 @@ __all__ = ["CallerProcess"]
 TEN_MINUTES = 600.0
 
 
-class CallerProcess(Child):
+class CallerProcess(NodeProcess):
     """The parent's side of one such process."""
 
     module = "tests.faults.caller"
@@ -213,8 +214,7 @@ class _Callers:
 
 def main() -> None:
     callers = _Callers()
-    commands = (callers.start, callers.answered, callers.finds_server, callers.state, callers.stop)
-    serve_commands({command.__name__: command for command in commands})
+    serve_commands(callers)
     callers.end()
 
 

@@ -9,13 +9,13 @@ from typing import Any
 
 import pytest
 
-from benchmarks.hosts import NoHosts, run_ip
-from benchmarks.lossy import LossyHosts
 from tests.conftest import Bridge
 from tests.faults.caller import CallerProcess
 from tests.faults.conftest import fault_of
 from tests.faults.table import Row
 from tests.support.clients import ClientProcess
+from tests.support.hosts import NoHosts, run_ip
+from tests.support.lossy import LossyHosts
 from tests.support.servers import ServerProcess
 from tests.support.times import LIMIT, TICK
 

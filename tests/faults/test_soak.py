@@ -13,11 +13,11 @@ from typing import Any
 
 import pytest
 
-from benchmarks.hosts import NoHosts
-from benchmarks.lossy import LossyHosts
 from tests.conftest import Bridge
 from tests.faults.caller import CallerProcess
 from tests.faults.table import Row
+from tests.support.hosts import NoHosts
+from tests.support.lossy import LossyHosts
 from tests.support.servers import ServerProcess
 from tests.support.times import TICK
 

@@ -5,13 +5,14 @@ Everything of rclpy happens in the one thread that spins: Jazzy's action client 
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, TypeVar
 
-from tests.support.process import Child, Unanswered, serve_commands
+from tests.support.child import Unanswered
+from tests.support.executor import run_in, spin
+from tests.support.process import NodeProcess
 from tests.support.times import LIMIT
 
 __all__ = ["ActionClientProcess", "Ended"]
@@ -26,7 +27,7 @@ class Ended(NamedTuple):
     sequence: list[int]
 
 
-class ActionClientProcess(Child):
+class ActionClientProcess(NodeProcess):
     """The parent's side of one such process. Its actions are all ``Fibonacci``."""
 
     module = "tests.support.action_clients"
@@ -106,20 +107,6 @@ class _Clients:
         self._services: dict[tuple[str, str], Any] = {}
         self._goals: dict[str, _Goal] = {}
         self._messages: dict[str, list[dict[str, int]]] = {}
-
-    def commands(self) -> dict[str, Callable[..., Any]]:
-        return {
-            "send": self.send,
-            "ended": self.ended,
-            "feedback": self.feedback,
-            "cancel_handle": self.cancel_handle,
-            "cancel": self.cancel,
-            "result": self.result,
-            "request": self.request,
-            "watch": self.watch,
-            "statuses": self.statuses,
-            "listed": self.listed,
-        }
 
     def send(self, name: str, order: int) -> str | None:
         from rclpy.action import ActionClient
@@ -246,13 +233,7 @@ class _Clients:
             time.sleep(0.005)
 
     def _run(self, function: Callable[[], T]) -> T:
-        """Run it in the thread that spins."""
-        done = threading.Event()
-        task = self._executor.create_task(function)
-        task.add_done_callback(lambda _: done.set())
-        assert done.wait(LIMIT), "the executor of the client process is stuck"
-        result: T = task.result()
-        return result
+        return run_in(self._executor, function)
 
 
 def _ended(response: Any) -> tuple[int, list[int]]:
@@ -273,20 +254,7 @@ def main() -> None:
     node = rclpy.create_node("stock_action_client")
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    clients = _Clients(node, executor)
-    finished = threading.Event()
-
-    def read() -> None:
-        serve_commands(clients.commands())
-        finished.set()
-        executor.create_task(lambda: None)
-
-    reader = threading.Thread(target=read)
-    reader.start()
-    while not finished.is_set():
-        executor.spin_once()
-    reader.join()
-    executor.shutdown()
+    spin(executor, _Clients(node, executor))
     node.destroy_node()
     rclpy.shutdown()
 

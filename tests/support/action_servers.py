@@ -10,12 +10,13 @@ import asyncio
 import sys
 import threading
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, Literal
 from uuid import UUID
 
-from tests.support.process import Child, Unanswered, serve_commands
+from tests.support.child import Unanswered, serve_commands
+from tests.support.executor import run_in
+from tests.support.process import NodeProcess
 from tests.support.times import LIMIT
 
 __all__ = ["FIBONACCI", "ActionServerProcess", "End"]
@@ -26,7 +27,7 @@ End = Literal["succeed", "abort", "raise", "return"]
 """How a goal ends: as succeeded or aborted, by an exception, or without setting a state."""
 
 
-class ActionServerProcess(Child):
+class ActionServerProcess(NodeProcess):
     """The parent's side of one such process."""
 
     module = "tests.support.action_servers"
@@ -231,20 +232,12 @@ class _Servers:
         self._executor = executor
         self._servers: dict[str, _Server] = {}
 
-    def commands(self) -> dict[str, Callable[..., Any]]:
-        names = ("serve", "stop", "release", "goals", "forge", "clear")
-        return {name: getattr(self, name) for name in names}
-
     def serve(self, **options: Any) -> None:
         self._servers[options["name"]] = _Server(self._node, options)
 
     def stop(self, name: str) -> None:
         server = self._servers.pop(name)
-        # In a thread that spins: rclpy has crashed on changes from another one.
-        done = threading.Event()
-        task = self._executor.create_task(server.server.destroy)
-        task.add_done_callback(lambda _: done.set())
-        assert done.wait(LIMIT), "the executor of the action servers is stuck"
+        run_in(self._executor, server.server.destroy)
         server.released.set()
 
     def release(self, name: str) -> None:
@@ -297,7 +290,7 @@ def main() -> None:
     spinner = threading.Thread(target=spin)
     spinner.start()
     servers = _Servers(node, executor)
-    serve_commands(servers.commands())
+    serve_commands(servers)
     servers.clear()
     finished.set()
     executor.create_task(lambda: None)

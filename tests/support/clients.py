@@ -17,8 +17,9 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from typing import Any, Literal
 
+from tests.support.child import Unanswered, serve_commands
 from tests.support.echo import ECHO, answer_to, request_of, service_class
-from tests.support.process import Child, Unanswered, serve_commands
+from tests.support.process import NodeProcess
 from tests.support.times import LIMIT, TICK
 
 __all__ = ["ClientProcess", "Tally"]
@@ -46,7 +47,7 @@ class Tally:
             self.wrong += 1
 
 
-class ClientProcess(Child):
+class ClientProcess(NodeProcess):
     """The parent's side of one such process."""
 
     module = "tests.support.clients"
@@ -307,7 +308,7 @@ def main() -> None:
     runner = _Runner(node)
 
     def read() -> None:
-        serve_commands({"start": runner.start, "result": runner.result})
+        serve_commands(runner)
         runner.stop()
 
     reader = threading.Thread(target=read)

@@ -1,116 +1,97 @@
-"""What is lost when one process floods a stock server and another is slow to take its responses.
+"""A process that floods one service: ``python -m tests.support.flood``.
 
-``python -m tests.support.flood`` measures it for rosasync and for ``client.call_async``, and prints
-a table. Nothing is asserted: without ``Retry`` the middleware may drop requests and
-responses, and how many depends on the machine.
+A bare loop keeps requests outstanding. It gives a lost one up early, and sends another.
 """
 
 from __future__ import annotations
 
-import argparse
-import asyncio
+import threading
 import time
-from collections.abc import Awaitable, Callable
-from typing import Literal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
 
-from rosasync import CallError, Limits, Retry, Session
-from rosasync._ros.domain import isolate
-from tests.support.clients import ClientProcess, Tally
-from tests.support.echo import ECHO, request_of
-from tests.support.servers import ServerProcess
-from tests.support.times import LIMIT, TICK
+from tests.support.child import Child, serve_commands
+from tests.support.echo import ECHO, service_class
+from tests.support.times import LIMIT
 
-__all__ = ["blocked_loop", "call_in_bursts", "main", "start_flood"]
+__all__ = ["CALLERS", "flooding"]
 
-BURST = 10
-Bridge = Literal["direct", "executor"]
-PATIENCE = 20 * TICK
-
-
-async def blocked_loop(block: float = TICK) -> None:
-    """Keep the running loop busy for ``block`` seconds at a time, until cancelled."""
-    while True:
-        time.sleep(block)  # noqa: ASYNC251
-        await asyncio.sleep(TICK / 10)
+CALLERS = 8
+"""Requests that are kept outstanding: fewer than the ten that a stock server queues."""
+LOST_AFTER = 0.1
+"""Seconds after which a request counts as lost."""
+ENOUGH = 100
+"""Answers after which the server is busy for certain."""
 
 
-async def start_flood(client: ClientProcess, server: ServerProcess, name: str) -> None:
-    """Have a process call a service, eight requests at once, until its result is asked for."""
-    answered = await server.answered(name)
-    await client.start(name, None, in_flight=8, timeout=4 * TICK)
-    await server.answered(name, answered + 100)
+@contextmanager
+def flooding(
+    name: str, srv_type: str = ECHO, callers: int = CALLERS, **options: Any
+) -> Iterator[None]:
+    """Flood a service in this block, at whose beginning its server is busy.
+
+    Args:
+        name: the service's name.
+        srv_type: the name of its type.
+        callers: how many requests to keep outstanding.
+        options: those of `Child`.
+    """
+    with Child("tests.support.flood", **options) as child:
+        child.ask_now("start", name=name, srv_type=srv_type, callers=callers)
+        yield
+        assert child.ask_now("stop") > ENOUGH
 
 
-async def call_in_bursts(
-    session: Session, name: str, calls: int, *, retry: Retry | None, timeout: float
-) -> Tally:
-    """Call a service, ten requests at once, and count how the calls end."""
-    tally = Tally()
+class _Flood:
+    """The child's side."""
 
-    async def one(text: str) -> None:
-        try:
-            response = await session.call(
-                ECHO, name, request_of(text), retry=retry, timeout=timeout
-            )
-        except CallError:
-            response = None
-        tally.count(text, response)
+    def __init__(self) -> None:
+        self._answered = 0
+        self._busy, self._enough = threading.Event(), threading.Event()
+        self._thread = threading.Thread(target=lambda: None)
 
-    for first in range(0, calls, BURST):
-        async with asyncio.TaskGroup() as group:
-            for number in range(first, min(first + BURST, calls)):
-                group.create_task(one(f"call {number}"))
-    return tally
+    def start(self, name: str, srv_type: str, callers: int) -> None:
+        self._thread = threading.Thread(target=self._run, args=(name, srv_type, callers))
+        self._thread.start()
+        assert self._busy.wait(LIMIT), f"{name} does not answer"
 
+    def stop(self) -> int:
+        """Return how many requests were answered."""
+        self._enough.set()
+        self._thread.join()
+        return self._answered
 
-async def main(calls: int) -> None:
-    """Measure each way in turn beside the same flood, and print how many calls were lost."""
+    def _run(self, name: str, srv_type: str, callers: int) -> None:
+        import rclpy
+        from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 
-    def ours(bridge: Bridge, retry: Retry | None) -> Callable[[], Awaitable[Tally]]:
-        async def run() -> Tally:
-            limits = Limits(grace=TICK)
-            async with Session("slow", bridge=bridge, limits=limits) as session:
-                await session.wait_for_service(ECHO, "/echo", timeout=LIMIT)
-                blocking = asyncio.create_task(blocked_loop())
-                try:
-                    return await call_in_bursts(
-                        session, "/echo", calls, retry=retry, timeout=PATIENCE
-                    )
-                finally:
-                    blocking.cancel()
-
-        return run
-
-    def stock(depth: int) -> Callable[[], Awaitable[Tally]]:
-        return lambda: victim.run(
-            "/echo", calls, in_flight=BURST, depth=depth, block=TICK, timeout=PATIENCE
-        )
-
-    retry = Retry(attempts=50, after=4 * TICK, backoff=1)
-    ways = {
-        "rosasync, direct bridge": ours("direct", None),
-        "rosasync, direct bridge, Retry": ours("direct", retry),
-        "rosasync, executor bridge": ours("executor", None),
-        "rosasync, executor bridge, Retry": ours("executor", retry),
-        "client.call_async, depth 10": stock(10),
-        "client.call_async, depth 1,000": stock(1000),
-    }
-    print(f"{'':34}{'calls':>7}{'lost':>7}    flood: {'calls':>7}{'lost':>7}")
-    async with ServerProcess() as server, ClientProcess() as flood, ClientProcess() as victim:
-        await server.serve("/echo")
-        for way, run in ways.items():
-            await start_flood(flood, server, "/echo")
-            tally = await run()
-            others = await flood.result()
-            assert not tally.wrong
-            print(
-                f"{way:34}{tally.calls:7}{tally.lost:7}           {others.calls:7}{others.lost:7}",
-                flush=True,
-            )
+        rclpy.init()
+        node = rclpy.create_node("flood")
+        service = service_class(srv_type)
+        client = node.create_client(service, name)
+        wait_set = _rclpy.WaitSet(0, 0, 0, 1, 0, 0, node.context.handle)
+        request, out = service.Request(), dict[int, float]()
+        if client.wait_for_service(LIMIT):
+            while not self._enough.is_set():
+                while len(out) < callers:
+                    out[client.handle.send_request(request)] = time.monotonic()
+                wait_set.clear_entities()
+                wait_set.add_client(client.handle)
+                wait_set.wait(round(LOST_AFTER * 1e9))
+                while (taken := client.handle.take_response(service.Response))[0] is not None:
+                    self._answered += out.pop(taken[0].request_id.sequence_number, None) is not None
+                lost = time.monotonic() - LOST_AFTER
+                while out and out[oldest := next(iter(out))] < lost:
+                    del out[oldest]
+                if self._answered > ENOUGH:
+                    self._busy.set()
+        wait_set.destroy_when_not_in_use()
+        node.destroy_node()
+        rclpy.shutdown()
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--calls", type=int, default=200, help="calls for each way")
-    isolate()
-    asyncio.run(main(parser.parse_args().calls))
+    flood = _Flood()
+    serve_commands(flood)
+    flood.stop()

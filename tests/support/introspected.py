@@ -8,7 +8,8 @@ from __future__ import annotations
 import threading
 from typing import Any
 
-from tests.support.process import Child, serve_commands
+from tests.support.child import serve_commands
+from tests.support.process import NodeProcess
 
 __all__ = ["NAME", "PARAMETER", "IntrospectedProcess"]
 
@@ -16,7 +17,7 @@ NAME = "/watched/switch"
 PARAMETER = "service_configure_introspection"
 
 
-class IntrospectedProcess(Child):
+class IntrospectedProcess(NodeProcess):
     """The parent's side of one such process."""
 
     module = "tests.support.introspected"

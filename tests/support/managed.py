@@ -12,7 +12,8 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-from tests.support.process import Child, serve_commands
+from tests.support.executor import spin
+from tests.support.process import NodeProcess
 from tests.support.times import LIMIT
 
 __all__ = ["NodesProcess"]
@@ -33,7 +34,7 @@ VALUES: dict[str, Any] = {
 """The parameters of a node of the kind "parameters", as rclpy declares them."""
 
 
-class NodesProcess(Child):
+class NodesProcess(NodeProcess):
     """The parent's side of one such process."""
 
     module = "tests.support.managed"
@@ -64,9 +65,6 @@ class _Nodes:
         self._executor = executor
         self._held = threading.Event()
         self._released = threading.Event()
-
-    def commands(self) -> dict[str, Callable[..., Any]]:
-        return {"add": self.add, "held": self.held, "release": self.release}
 
     def add(self, kind: str, name: str) -> None:
         make: Callable[[str], Any] = getattr(self, f"_{kind}")
@@ -225,20 +223,7 @@ def main() -> None:
     # The first node reads the middleware's profile, a file that is gone after "ready".
     executor.add_node(_node("first"))
     nodes = _Nodes(executor)
-    finished = threading.Event()
-
-    def read() -> None:
-        serve_commands(nodes.commands())
-        nodes.release()
-        finished.set()
-        executor.create_task(lambda: None)
-
-    reader = threading.Thread(target=read)
-    reader.start()
-    while not finished.is_set():
-        executor.spin_once()
-    reader.join()
-    executor.shutdown()
+    spin(executor, nodes, nodes.release)
     rclpy.shutdown()
 
 

@@ -20,15 +20,15 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
+from tests.support.child import Unanswered
 from tests.support.echo import ECHO, fill, response_to, service_class
-from tests.support.process import Child, Unanswered, ended, profile, serve_commands
+from tests.support.executor import run_in, spin
+from tests.support.process import NodeProcess, ended, profile
 from tests.support.times import LIMIT
 
 __all__ = ["Delay", "Misbehaviour", "ServerProcess", "running"]
-
-T = TypeVar("T")
 
 Delay = float | tuple[float, float] | Literal["hold", "never"] | None
 """When a request is answered: at once (None), after a number of seconds, after a random number of
@@ -52,12 +52,12 @@ def running(program: Path, *arguments: str) -> Iterator[None]:
             yield
 
 
-class ServerProcess(Child):
+class ServerProcess(NodeProcess):
     """The parent's side of one such process.
 
     Args:
         node: the name of its node. Two that live at the same time need different ones.
-        options: those of `Child`.
+        options: those of `NodeProcess`.
     """
 
     module = "tests.support.servers"
@@ -251,10 +251,6 @@ class _Servers:
         self._later = _Later()
         self._services: dict[str, _Service] = {}
 
-    def commands(self) -> dict[str, Callable[..., Any]]:
-        names = ("serve", "stop", "change", "release", "received", "answered", "clear")
-        return {name: getattr(self, name) for name in names}
-
     def serve(
         self,
         name: str,
@@ -281,7 +277,7 @@ class _Servers:
                     )
                 )
 
-        self._in_executor(create)
+        run_in(self._executor, create)
 
     def stop(self, name: str) -> None:
         service = self._services[name]
@@ -290,13 +286,13 @@ class _Servers:
             while service.services:
                 self._node.destroy_service(service.services.pop())
 
-        self._in_executor(destroy)
+        run_in(self._executor, destroy)
 
     def change(self, name: str, delay: Delay) -> None:
         self._services[name].delay = delay
 
     def release(self, name: str, count: int | None, newest: bool) -> None:
-        self._in_executor(partial(self._services[name].release, count, newest))
+        run_in(self._executor, partial(self._services[name].release, count, newest))
 
     def received(self, name: str, at_least: int) -> list[str]:
         service = self._services[name]
@@ -317,15 +313,6 @@ class _Servers:
             self.stop(name)
         self._services.clear()
 
-    def _in_executor(self, function: Callable[[], T]) -> T:
-        """Run it in the thread that spins: rclpy has crashed on changes from another thread."""
-        done = threading.Event()
-        task = self._executor.create_task(function)
-        task.add_done_callback(lambda _: done.set())
-        assert done.wait(LIMIT), "the executor of the server process is stuck"
-        result: T = task.result()
-        return result
-
 
 def main() -> None:
     import rclpy
@@ -336,20 +323,7 @@ def main() -> None:
     node = rclpy.create_node(sys.argv[1])
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    servers = _Servers(node, executor)
-    finished = threading.Event()
-
-    def read() -> None:
-        serve_commands(servers.commands())
-        finished.set()
-        executor.create_task(lambda: None)
-
-    reader = threading.Thread(target=read)
-    reader.start()
-    while not finished.is_set():
-        executor.spin_once()
-    reader.join()
-    executor.shutdown()
+    spin(executor, _Servers(node, executor))
     node.destroy_node()
     rclpy.shutdown()
 

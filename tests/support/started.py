@@ -6,7 +6,8 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from tests.support.process import Child, serve_commands
+from tests.support.child import serve_commands
+from tests.support.process import NodeProcess
 
 __all__ = ["NAME", "Refused", "StartedProcess", "typed"]
 
@@ -22,7 +23,7 @@ def typed(values: dict[str, Any]) -> dict[str, Any]:
     return {name: repr(value) for name, value in values.items()}
 
 
-class StartedProcess(Child):
+class StartedProcess(NodeProcess):
     """The parent's side of one such process."""
 
     module = "tests.support.started"

@@ -18,8 +18,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from benchmarks.hosts import ENVIRONMENT, NoHosts, bring_up, check_namespaces, run_ip
-from benchmarks.pipes import Child, answer_lines
+from tests.support.child import Child, serve_commands
+from tests.support.hosts import ENVIRONMENT, NoHosts, bring_up, check_namespaces, run_ip
 
 __all__ = ["LossyHosts"]
 
@@ -77,7 +77,7 @@ class LossyHosts:
                 self._stack.callback(run_ip, "netns", "delete", self.namespace(name))
             namespaces = [self.namespace(name) for name in self._names]
             # Leaves the stack first: its devices end with it.
-            self._switch = self._stack.enter_context(Child("benchmarks.lossy", *namespaces))
+            self._switch = self._stack.enter_context(Child("tests.support.lossy", *namespaces))
             self.set(**self._link)
             for name in self._names:
                 bring_up(self.namespace(name), self.address(name))
@@ -106,11 +106,11 @@ class LossyHosts:
 
     def set(self, **link: Any) -> None:
         """Change ``loss``, ``delay`` or ``seed`` for the packets from now on."""
-        self._switch.ask("set", timeout=PATIENCE, **link)
+        self._switch.ask_now("set", patience=PATIENCE, **link)
 
     def counts(self) -> dict[str, int]:
         """Return the number of ``frames`` and ``bytes`` sent so far, and of frames ``lost``."""
-        counts: dict[str, int] = self._switch.ask("counts", timeout=PATIENCE)
+        counts: dict[str, int] = self._switch.ask_now("counts", patience=PATIENCE)
         return counts
 
 
@@ -129,20 +129,15 @@ class Switch:
         self._counts = {"frames": 0, "bytes": 0, "lost": 0}
         threading.Thread(target=self._run, daemon=True).start()
 
-    def answer(self, message: dict[str, Any]) -> dict[str, Any]:
-        answer: dict[str, Any] = getattr(self, "do_" + message.pop("do"))(**message)
-        return answer
-
-    def do_set(
+    def set(
         self, loss: float | None = None, delay: float | None = None, seed: int | None = None
-    ) -> dict[str, Any]:
+    ) -> None:
         self._loss = self._loss if loss is None else loss
         self._delay = self._delay if delay is None else delay
         if seed is not None:
             self._random.seed(seed)
-        return {}
 
-    def do_counts(self) -> dict[str, Any]:
+    def counts(self) -> dict[str, int]:
         return dict(self._counts)
 
     def _run(self) -> None:
@@ -212,4 +207,4 @@ def _open_device(namespace: str) -> int:
 
 
 if __name__ == "__main__":
-    answer_lines(Switch([_open_device(namespace) for namespace in sys.argv[1:]]).answer)
+    serve_commands(Switch([_open_device(namespace) for namespace in sys.argv[1:]]))

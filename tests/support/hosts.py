@@ -1,4 +1,4 @@
-"""Two hosts on one machine: temporary network namespaces, joined by a virtual cable."""
+"""Hosts on one machine: temporary network namespaces, joined by a virtual cable."""
 
 from __future__ import annotations
 
