@@ -476,7 +476,7 @@ async def test_nothing_is_kept_of_what_has_ended(state: ProxyState) -> None:
     async with staged() as stage:
         await stage.reach(state)
         await turns()
-        assert stage.proxy._working is None
+        assert stage.proxy._current.working is None
         assert stage.session.core.gateway.pending == 0
 
 

@@ -5,19 +5,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import enum
-import time
 from collections.abc import Mapping
 from copy import deepcopy
 from typing import TYPE_CHECKING, Any, Generic, cast
 
-from rosasync.errors import (
-    CallError,
-    GoalAborted,
-    GoalCanceled,
-    GoalRejected,
-    SessionClosed,
-    UsageError,
-)
+from rosasync._core.operations import CurrentOperation, Operation
+from rosasync.errors import CallError, GoalAborted, GoalCanceled, GoalRejected, SessionClosed
 from rosasync.options import check_timeout
 from rosasync.typing import ActionType, FeedbackT, GoalT, ResultT, Timeout
 
@@ -80,18 +73,14 @@ class AsyncActionProxy(Generic[GoalT, ResultT, FeedbackT]):
         SessionClosed: the session is closed.
     """
 
-    # As in `AsyncServiceProxy`: any thread replaces `_pursuit` as a whole, and the loop writes only
-    # into the one that it works on, `_working`. So no lock is needed.
     __slots__ = (
         "__weakref__",
         "_action_name",
         "_action_type",
         "_actions",
-        "_closed",
+        "_current",
         "_gateway",
-        "_pursuit",
         "_timeout",
-        "_working",
     )
 
     def __init__(
@@ -108,9 +97,7 @@ class AsyncActionProxy(Generic[GoalT, ResultT, FeedbackT]):
         self._actions.describe(action_type, action_name)
         self._action_type = action_type
         self._action_name = action_name
-        self._pursuit = _Pursuit(ActionState.IDLE)
-        self._working: _Pursuit | None = None
-        self._closed = False
+        self._current = CurrentOperation(core.gateway, _Pursuit(ActionState.IDLE))
 
     def __repr__(self) -> str:
         return f"<AsyncActionProxy {self._action_name} {self.get_state().name}>"
@@ -146,12 +133,8 @@ class AsyncActionProxy(Generic[GoalT, ResultT, FeedbackT]):
             wait,
         )
         seconds = check_timeout(timeout, None)
-        if self._closed:
-            raise UsageError(f"{self._action_name}: the proxy was shut down: create a new one")
-        self._replace(_Pursuit(ActionState.WAITING, arguments, seconds))
-        if self._closed:
-            # Another thread has shut the proxy down since the check.
-            self.cancel_goal()
+        pursuit = _Pursuit(ActionState.WAITING, arguments, seconds)
+        self._current.start(self._action_name, pursuit, self._begin, stop=self.cancel_goal)
 
     def make_goal(self, goal: GoalT | Mapping[str, Any] | None) -> GoalT:
         """Return the message that `send_goal` sends for this argument, to prepare it in advance.
@@ -169,9 +152,9 @@ class AsyncActionProxy(Generic[GoalT, ResultT, FeedbackT]):
         becomes CANCELED; if the server accepts it nevertheless, it is cancelled in the background.
         In the other states nothing changes.
         """
-        pursuit = self._pursuit
+        pursuit = self._current.operation
         if pursuit.state is ActionState.WAITING:
-            self._replace(_Pursuit(ActionState.CANCELED))
+            self._current.replace(_Pursuit(ActionState.CANCELED), self._begin)
         elif pursuit.state is ActionState.ACTIVE and not pursuit.cancelling:
             pursuit.cancelling = True
             with contextlib.suppress(SessionClosed):
@@ -179,7 +162,7 @@ class AsyncActionProxy(Generic[GoalT, ResultT, FeedbackT]):
 
     def get_state(self) -> ActionState:
         """Return the state. Cheap: it only reads attributes."""
-        pursuit = self._pursuit
+        pursuit = self._current.operation
         state = pursuit.state
         if state is ActionState.ACTIVE and pursuit.cancelling:
             return ActionState.CANCELING
@@ -187,60 +170,29 @@ class AsyncActionProxy(Generic[GoalT, ResultT, FeedbackT]):
 
     def get_feedback(self) -> FeedbackT | None:
         """Return the goal's newest feedback; None before the first."""
-        return cast("FeedbackT | None", self._pursuit.feedback)
+        return cast("FeedbackT | None", self._current.operation.feedback)
 
     def get_result(self) -> ResultT | None:
         """Return the result of a goal that SUCCEEDED and become IDLE; None in any other state.
 
         The result of an ABORTED or CANCELED goal is that of its error.
         """
-        pursuit = self._pursuit
-        if pursuit.state is not ActionState.SUCCEEDED:
-            return None
-        # The loop does not write into a finished pursuit, so this thread may.
-        pursuit.state = ActionState.IDLE
-        result, pursuit.result = pursuit.result, None
-        return cast(ResultT, result)
+        result = self._current.operation.take(ActionState.SUCCEEDED, ActionState.IDLE)
+        return cast("ResultT | None", result)
 
     def get_errors(self) -> list[Exception]:
         """Return the error of the goal, or of its cancellation if the server refuses that."""
-        error = self._pursuit.error
-        return [] if error is None else [error]
+        return self._current.operation.errors()
 
     def shutdown(self) -> None:
         """Cancel the goal, and refuse further ones; idempotent."""
-        self._closed = True
+        self._current.closed = True
         self.cancel_goal()
-
-    def _replace(self, pursuit: _Pursuit) -> None:
-        before, self._pursuit = self._pursuit, pursuit
-        gateway = self._gateway
-        gateway.discard(before)
-        if pursuit.state not in PENDING:
-            with contextlib.suppress(SessionClosed):
-                gateway.call(self._reconcile)
-            return
-        gateway.register(pursuit)
-        try:
-            gateway.call(self._reconcile)
-        except SessionClosed as error:
-            gateway.discard(pursuit)
-            pursuit.fail(error)
 
     # On the loop's thread.
 
-    def _reconcile(self) -> None:
-        """Leave a replaced goal, and start to pursue the current one."""
-        pursuit, working = self._pursuit, self._working
-        if pursuit is working:
-            return
-        if working is not None and working.task is not None:
-            working.task.cancel()
-        self._working = None
-        if pursuit.state is ActionState.WAITING and not pursuit.begun:
-            pursuit.begun = True
-            self._working = pursuit
-            pursuit.task = self._gateway.loop.create_task(self._work(pursuit))
+    def _begin(self, pursuit: _Pursuit) -> asyncio.Task[None]:
+        return self._gateway.loop.create_task(self._work(pursuit))
 
     def _cancel(self, pursuit: _Pursuit) -> None:
         goal = pursuit.goal
@@ -278,31 +230,19 @@ class AsyncActionProxy(Generic[GoalT, ResultT, FeedbackT]):
         except Exception as error:
             pursuit.fail(error)
         finally:
-            self._gateway.discard(pursuit)
             pursuit.goal = None
             if pursuit.cancel_task is not None:
                 pursuit.cancel_task.cancel()
-            if self._working is pursuit:
-                self._working = None
+            self._current.leave(pursuit)
 
 
-class _Pursuit:
+class _Pursuit(Operation[ActionState]):
     """One goal of a proxy, from its sending to its end, or none."""
 
-    __slots__ = (
-        "_arguments",
-        "begun",
-        "cancel_task",
-        "cancelling",
-        "error",
-        "feedback",
-        "goal",
-        "result",
-        "started",
-        "state",
-        "task",
-        "timeout",
-    )
+    __slots__ = ("_arguments", "cancel_task", "cancelling", "feedback", "goal")
+
+    PENDING = PENDING
+    FAILED = ActionState.ERROR
 
     def __init__(
         self,
@@ -310,16 +250,10 @@ class _Pursuit:
         arguments: ActArguments | None = None,
         timeout: float | None = None,
     ) -> None:
-        self.state = state
-        self.timeout = timeout
-        self.started = time.monotonic()
-        self.begun = False
+        super().__init__(state, timeout)
         self.cancelling = False
         self.feedback: Any = None
-        self.result: Any = None
-        self.error: Exception | None = None
         self.goal: Goal[Any, Any] | None = None
-        self.task: asyncio.Task[None] | None = None
         self.cancel_task: asyncio.Task[None] | None = None
         self._arguments = arguments
 
@@ -328,12 +262,6 @@ class _Pursuit:
         """The arguments of the goal."""
         assert self._arguments is not None
         return self._arguments
-
-    def time_left(self) -> float | None:
-        """Return the seconds that are left of the timeout."""
-        if self.timeout is None:
-            return None
-        return max(0.0, self.timeout - (time.monotonic() - self.started))
 
     def accept(self, goal: Goal[Any, Any]) -> None:
         """Go on with the goal that the server has accepted."""
@@ -344,15 +272,3 @@ class _Pursuit:
     def set_feedback(self, feedback: Any) -> None:
         """Keep the newest feedback."""
         self.feedback = feedback
-
-    def end(self, state: ActionState, result: Any = None, error: Exception | None = None) -> None:
-        """Set the outcome, unless there is one."""
-        if self.state in PENDING:
-            self.result = result
-            self.error = error
-            # Last, because other threads read it first.
-            self.state = state
-
-    def fail(self, error: Exception) -> None:
-        """End with an error, unless it has ended already."""
-        self.end(ActionState.ERROR, error=error)

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import enum
-import time
 from collections.abc import Mapping
 from copy import deepcopy
 from typing import TYPE_CHECKING, Any, Generic, cast
 
 from rosasync._core.aio import start_task
-from rosasync.errors import SessionClosed, UsageError
+from rosasync._core.operations import CurrentOperation, Operation
 from rosasync.options import Retry, check_retry, check_timeout
 from rosasync.typing import RequestT, ResponseT, ServiceType, Timeout
 
@@ -92,21 +90,15 @@ class AsyncServiceProxy(Generic[RequestT, ResponseT]):
         SessionClosed: the session is closed.
     """
 
-    # `_operation` is the current operation. Any thread replaces it as a whole, and the loop writes
-    # only into the operation that it works on, `_working`. So no lock is needed, and the result of
-    # a replaced call is never visible. After each replacement the loop reconciles the two. Posts
-    # may be reordered between threads, but the last reconciliation sees the last operation.
     __slots__ = (
         "__weakref__",
         "_arguments",
-        "_closed",
+        "_current",
         "_gateway",
-        "_operation",
         "_pool",
         "_retry",
         "_service",
         "_timeout",
-        "_working",
     )
 
     def __init__(
@@ -128,9 +120,7 @@ class AsyncServiceProxy(Generic[RequestT, ResponseT]):
         self._timeout = core.timeout
         self._retry = retry
         self._service = core.arguments.service(srv_type, srv_name, qos)
-        self._operation = _Operation(ProxyState.IDLE)
-        self._working: _Operation | None = None
-        self._closed = False
+        self._current = CurrentOperation(core.gateway, _Operation(ProxyState.IDLE))
 
     def __repr__(self) -> str:
         return f"<AsyncServiceProxy {self._service.key.srv_name} {self.get_state().name}>"
@@ -191,75 +181,37 @@ class AsyncServiceProxy(Generic[RequestT, ResponseT]):
         A call or wait in progress is cancelled, an unread response is dropped, and the state
         becomes ABORTED. In the other states nothing changes.
         """
-        if self._operation.state in STOPPABLE:
-            self._replace(_Operation(ProxyState.ABORTED))
+        if self._current.operation.state in STOPPABLE:
+            self._current.replace(_Operation(ProxyState.ABORTED), self._begin)
 
     def get_state(self) -> ProxyState:
         """Return the state. Cheap: it only reads an attribute."""
-        return self._operation.state
+        return self._current.operation.state
 
     def get_response(self) -> ResponseT | None:
         """Return the response and become IDLE; return None if there is no unread response."""
-        operation = self._operation
-        if operation.state is not ProxyState.RESPONSE_READY:
-            return None
-        # The loop does not write into a finished operation, so this thread may.
-        operation.state = ProxyState.IDLE
-        response, operation.response = operation.response, None
-        return cast(ResponseT, response)
+        response = self._current.operation.take(ProxyState.RESPONSE_READY, ProxyState.IDLE)
+        return cast("ResponseT | None", response)
 
     def get_errors(self) -> list[Exception]:
         """Return the error in the states TIMEOUT and ERROR; otherwise an empty list."""
-        error = self._operation.error
-        return [] if error is None else [error]
+        return self._current.operation.errors()
 
     def shutdown(self) -> None:
         """Stop the call, and refuse further ones; idempotent."""
-        self._closed = True
+        self._current.closed = True
         self.stop_call()
 
     def _start(self, operation: _Operation) -> None:
-        if self._closed:
-            raise UsageError(
-                f"{self._service.key.srv_name}: the proxy was shut down: create a new one"
-            )
-        self._replace(operation)
-        if self._closed:
-            # Another thread has shut the proxy down since the check.
-            self.stop_call()
-
-    def _replace(self, operation: _Operation) -> None:
-        before, self._operation = self._operation, operation
-        gateway = self._gateway
-        gateway.discard(before)
-        if operation.state not in PENDING:
-            with contextlib.suppress(SessionClosed):
-                gateway.call(self._reconcile)
-            return
-        gateway.register(operation)
-        try:
-            gateway.call(self._reconcile)
-        except SessionClosed as error:
-            gateway.discard(operation)
-            operation.fail(error)
+        self._current.start(self._service.key.srv_name, operation, self._begin, stop=self.stop_call)
 
     # On the loop's thread.
 
-    def _reconcile(self) -> None:
-        """Cancel the work on a replaced operation, and start the work on the current one."""
-        operation, working = self._operation, self._working
-        if operation is working:
-            return
-        if working is not None and working.task is not None:
-            working.task.cancel()
-        self._working = None
-        if operation.state in PENDING and not operation.begun:
-            operation.begun = True
-            self._working = operation
-            loop, work = self._gateway.loop, self._work(operation)
-            # A call is sent in the same tick. A wait has to be visible as WAITING first.
-            calls = operation.state is ProxyState.RUNNING
-            operation.task = start_task(loop, work) if calls else loop.create_task(work)
+    def _begin(self, operation: _Operation) -> asyncio.Task[None]:
+        loop, work = self._gateway.loop, self._work(operation)
+        # A call is sent in the same tick. A wait has to be visible as WAITING first.
+        calls = operation.state is ProxyState.RUNNING
+        return start_task(loop, work) if calls else loop.create_task(work)
 
     async def _work(self, operation: _Operation) -> None:
         try:
@@ -272,9 +224,7 @@ class AsyncServiceProxy(Generic[RequestT, ResponseT]):
         except Exception as error:
             operation.fail(error)
         finally:
-            self._gateway.discard(operation)
-            if self._working is operation:
-                self._working = None
+            self._current.leave(operation)
 
     async def _perform(self, operation: _Operation) -> tuple[ProxyState, Any]:
         service = self._pool.service_of(self._service)
@@ -287,26 +237,19 @@ class AsyncServiceProxy(Generic[RequestT, ResponseT]):
             operation.wait,
             self._retry,
             copy=True,
-            # The task is cancelled later: by `_reconcile`, and then in its next step.
-            is_cancelled=lambda: self._operation is not operation,
+            # The task is cancelled later: when the loop reconciles, and then in its next step.
+            is_cancelled=lambda: self._current.operation is not operation,
         )
         return ProxyState.RESPONSE_READY, response
 
 
-class _Operation:
-    """One operation of a proxy: a call, a wait, or none."""
+class _Operation(Operation[ProxyState]):
+    """A call, a wait, or none."""
 
-    __slots__ = (
-        "begun",
-        "error",
-        "request",
-        "response",
-        "started",
-        "state",
-        "task",
-        "timeout",
-        "wait",
-    )
+    __slots__ = ("request", "wait")
+
+    PENDING = PENDING
+    FAILED = ProxyState.ERROR
 
     def __init__(
         self,
@@ -315,30 +258,6 @@ class _Operation:
         timeout: float | None = None,
         wait: bool | float = True,
     ) -> None:
-        self.state = state
+        super().__init__(state, timeout)
         self.request = request
-        self.timeout = timeout
         self.wait = wait
-        self.started = time.monotonic()
-        self.begun = False
-        self.response: Any = None
-        self.error: Exception | None = None
-        self.task: asyncio.Task[None] | None = None
-
-    def time_left(self) -> float | None:
-        """Return the seconds that are left of the timeout."""
-        if self.timeout is None:
-            return None
-        return max(0.0, self.timeout - (time.monotonic() - self.started))
-
-    def end(self, state: ProxyState, response: Any = None, error: Exception | None = None) -> None:
-        """Set the outcome, unless there is one."""
-        if self.state in PENDING:
-            self.response = response
-            self.error = error
-            # Last, because other threads read it first.
-            self.state = state
-
-    def fail(self, error: Exception) -> None:
-        """End with an error, unless it has ended already."""
-        self.end(ProxyState.ERROR, error=error)
