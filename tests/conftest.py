@@ -24,6 +24,7 @@ from tests.faults.table import pytest_terminal_summary
 from tests.support.action_servers import ActionServerProcess
 from tests.support.child import Unanswered
 from tests.support.clients import ClientProcess
+from tests.support.fake_graph import FakeGraph
 from tests.support.servers import ServerProcess
 from tests.support.times import LIMIT
 
@@ -80,6 +81,12 @@ def nothing_left_behind(caplog: pytest.LogCaptureFixture) -> Iterator[None]:
     records = [*caplog.get_records("setup"), *caplog.get_records("call")]
     errors = [r for r in records if r.name == "asyncio" and r.levelno >= logging.ERROR]
     assert not errors, "\n".join(r.getMessage() for r in errors[:3])
+
+
+@pytest.fixture
+def fake_graph() -> FakeGraph:
+    """An empty graph in memory, with faults of all servers at once."""
+    return FakeGraph()
 
 
 @pytest.fixture(params=["direct", "executor"])

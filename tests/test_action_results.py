@@ -8,7 +8,9 @@ from typing import Any
 from test_msgs.action import Fibonacci
 
 from rosasync._actions.results import BURST, PERIOD, ResultRequests
-from rosasync.testing import FakeGraph, FakeNode, VirtualClock
+from rosasync.testing import VirtualClock
+from rosasync.testing._memory.graph import MemoryNode
+from tests.support.fake_graph import FakeGraph
 
 GET = Fibonacci.Impl.GetResultService
 
@@ -18,7 +20,7 @@ class Requests:
 
     def __init__(self) -> None:
         self.graph = FakeGraph()
-        self.node = FakeNode(self.graph)
+        self.node = MemoryNode(self.graph)
         self.server = self.graph.serve(GET, "/get_result", lambda request: GET.Response())
         self.results: list[bytes] = []
         service = self.node.describe(GET, "/get_result", None)

@@ -25,8 +25,8 @@ from rosasync import (
     UsageError,
 )
 from rosasync.behaviours import SendGoal
-from rosasync.testing import FakeGraph
 from tests.support.action_servers import ActionServerProcess
+from tests.support.fake_graph import FakeGraph
 from tests.support.times import LIMIT, TICK, until
 
 State = ActionState

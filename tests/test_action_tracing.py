@@ -13,7 +13,7 @@ from test_msgs.action import Fibonacci
 
 from rosasync import GoalAborted, GoalTimeout, Session
 from rosasync.opentelemetry import OpenTelemetryTrace
-from rosasync.testing import FakeGraph
+from tests.support.fake_graph import FakeGraph
 from tests.support.times import LIMIT, TICK
 from tests.support.traced import Recorder
 

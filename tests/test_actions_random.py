@@ -23,7 +23,8 @@ from rosasync import (
     Session,
     SessionClosed,
 )
-from rosasync.testing import FakeGraph, VirtualClock
+from rosasync.testing import VirtualClock
+from tests.support.fake_graph import FakeGraph
 from tests.support.scripted_action import ScriptedAction
 
 EXPECTED = (

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from rosasync import AsyncServiceProxy, Limits, Retry, Session
-from rosasync.testing import FakeGraph
 from tests.support.echo import ECHO, fill, request_of, service_class
+from tests.support.fake_graph import FakeGraph
 from tests.support.times import LIMIT
 
 NAME = "/echo"

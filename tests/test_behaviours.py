@@ -31,9 +31,9 @@ from rosasync import (
 )
 from rosasync import Retry as Repeat
 from rosasync.behaviours import CallService, FromBlackboard, FromConstant, WaitForService
-from rosasync.testing import FakeGraph
 from tests.support.checks import assert_clean
 from tests.support.echo import ECHO, answer_to, request_of
+from tests.support.fake_graph import FakeGraph, FakeServer
 from tests.support.times import LIMIT, TICK, until
 
 if TYPE_CHECKING:
@@ -64,6 +64,13 @@ async def graph() -> FakeGraph:
 async def fake_session(graph: FakeGraph) -> AsyncIterator[Session]:
     async with graph.session() as session:
         yield session
+
+
+def received(graph: FakeGraph) -> list[str]:
+    """What the graph's only server has received."""
+    (server,) = graph.servers
+    assert isinstance(server, FakeServer)
+    return [request.load_namespace for request in server.received]
 
 
 def blackboard(*names: str) -> Any:
@@ -240,8 +247,7 @@ class TestOutcomes:
         ready(leaf, fake_session)
         for _ in range(3):
             assert await ticked(leaf) is Status.SUCCESS
-        received = [request.load_namespace for request in graph.servers[0].received]
-        assert received == ["0", "1", "2"]
+        assert received(graph) == ["0", "1", "2"]
 
 
 class TestWaitForService:
@@ -340,7 +346,7 @@ class TestBlackboard:
         assert isinstance(blackboard("error").error, TypeError)
         blackboard("request").request = request_of("a")
         assert await ticked(leaf) is Status.SUCCESS
-        assert len(graph.servers[0].received) == 1
+        assert received(graph) == ["a"]
 
     async def test_a_new_run_takes_the_older_answer_off_the_blackboard(
         self, graph: FakeGraph, fake_session: Session

@@ -25,7 +25,7 @@ from tests.support.echo import ECHO, request_of
 from tests.support.times import LIMIT
 
 if TYPE_CHECKING:
-    from rosasync.testing import FakeGraph
+    from tests.support.fake_graph import FakeGraph
 
 CALLS = 150
 BATCHES = 4
@@ -72,7 +72,7 @@ class Cost:
 
 
 FAKE = Cost(functions=17, c_functions=15, peak=2000, left=100, cycles=0)
-"""On the fake graph, which keeps a list of everything sent."""
+"""On the fake graph, which keeps the number of every request."""
 BOUNDS = {
     "direct": Cost(functions=21, c_functions=19, peak=1700, left=50, cycles=0),
     "executor": Cost(functions=20, c_functions=17, peak=6300, left=50, cycles=0),

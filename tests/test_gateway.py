@@ -12,7 +12,7 @@ import pytest
 
 from rosasync import SessionClosed
 from rosasync._core.gateway import LoopGateway
-from rosasync.testing import FakeGraph
+from tests.support.fake_graph import FakeGraph
 from tests.support.times import LIMIT, until
 
 

@@ -13,9 +13,10 @@ from rclpy.qos import QoSProfile, QoSReliabilityPolicy
 
 from rosasync import AsyncServiceProxy, Limits, ProxyState, ServiceUnavailable, Session
 from rosasync._client.mismatch import MISMATCH_DELAY
-from rosasync.testing import FakeGraph, VirtualClock
+from rosasync.testing import VirtualClock
 from tests.support.checks import assert_clean, check_call
 from tests.support.echo import ECHO, answer_to, request_of
+from tests.support.fake_graph import FakeGraph
 from tests.support.servers import ServerProcess
 from tests.support.times import LIMIT, TICK, until
 

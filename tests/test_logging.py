@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from rosasync import Limits, ResponseTimeout, Retry, ServiceUnavailable, Session
-from rosasync.testing import FakeGraph, VirtualClock
+from rosasync.testing import VirtualClock
 from rosasync.tracing import CallTrace, _duration
 from tests.support.echo import ECHO
+from tests.support.fake_graph import FakeGraph
 from tests.support.serving import Holder, ask, discard, echo_call, echo_of
 from tests.support.times import LIMIT, TICK, until
 

@@ -10,7 +10,7 @@ from rcl_interfaces.srv import SetParameters
 from std_srvs.srv import SetBool
 
 from rosasync.testing import Graph, StubServer
-from rosasync.testing.matching import matches
+from rosasync.testing._matching import matches
 from tests.support.times import TICK
 
 pytestmark = pytest.mark.rosasync(strict=False)

@@ -25,8 +25,8 @@ from tests.support.serving import AnyCall, Holder, Response, ask, discard, echo_
 from tests.support.times import LIMIT, TICK, until
 
 if TYPE_CHECKING:
-    from rosasync.testing import FakeGraph
     from tests.conftest import Bridge
+    from tests.support.fake_graph import FakeGraph
     from tests.support.servers import ServerProcess
 
 

@@ -1,4 +1,4 @@
-"""The contract of the ports: one suite for the real ones and the fake."""
+"""The contract of the ports: one suite for the real ones and those in memory."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ from rosasync._core.ports import ClientPort, NodePort, TopicQos
 from rosasync._ros.node import RosNode
 from rosasync._status.wire import process_of
 from rosasync.options import Limits, SessionOptions
-from rosasync.testing import FakeGraph, FakeNode
+from rosasync.testing._memory.graph import MemoryNode
 from tests.support.echo import ECHO, answer_to, fill, request_of, service_class
+from tests.support.fake_graph import FakeGraph
 from tests.support.servers import ServerProcess
 from tests.support.times import until
 
-Kind = Literal["fake", "direct", "executor"]
+Kind = Literal["memory", "direct", "executor"]
 
 
 class World:
@@ -53,10 +54,10 @@ class World:
         self.responses.append((sequence_number, answer_to(response)))
 
 
-@pytest.fixture(params=["fake", "direct", "executor"])
+@pytest.fixture(params=["memory", "direct", "executor"])
 async def world(request: pytest.FixtureRequest) -> AsyncIterator[World]:
     kind: Kind = request.param
-    if kind == "fake":
+    if kind == "memory":
         graph = FakeGraph()
         response_class = service_class(ECHO).Response
 
@@ -67,7 +68,7 @@ async def world(request: pytest.FixtureRequest) -> AsyncIterator[World]:
             graph.find(ECHO, name)[0].close()
 
         world = World(serve, vanish)
-        world.node = FakeNode(graph, world.changed)
+        world.node = MemoryNode(graph, world.changed)
         yield world
         world.node.close()
         return
@@ -291,7 +292,7 @@ async def test_an_action_is_described_by_its_services_and_topics(world: World) -
 
 
 async def test_statuses_are_read_without_deserializing_them(world: World) -> None:
-    if world.node.bridge == "fake":
+    if world.node.bridge == "memory":
         return  # It serializes nothing.
     arrived: list[bytes] = []
     subscription = world.node.open_subscription(

@@ -28,9 +28,9 @@ from rosasync import (
     SessionClosed,
     UsageError,
 )
-from rosasync.testing import FakeGraph, FakeServer
 from tests.support.checks import assert_clean
 from tests.support.echo import ECHO, answer_to, request_of
+from tests.support.fake_graph import FakeGraph, FakeServer
 from tests.support.times import LIMIT, TICK, until
 
 if TYPE_CHECKING:

@@ -27,8 +27,8 @@ from tests.support.serving import (
 from tests.support.times import LIMIT, until
 
 if TYPE_CHECKING:
-    from rosasync.testing import FakeGraph
     from tests.conftest import Bridge
+    from tests.support.fake_graph import FakeGraph
 
 FACTORIES: dict[str, Any] = {"lazy": None}
 if sys.version_info >= (3, 12):

@@ -17,8 +17,9 @@ from tests.support.serving import AnyCall, Response, ask, echo_of, settled
 from tests.support.times import until
 
 if TYPE_CHECKING:
-    from rosasync.testing import FakeGraph, VirtualClock
+    from rosasync.testing import VirtualClock
     from tests.conftest import Bridge
+    from tests.support.fake_graph import FakeGraph
 
 MANY = Limits(in_flight=100, server_depth=None)
 STANDING = TARGET + INTERVAL

@@ -26,7 +26,7 @@ from tests.support.serving import (
 from tests.support.times import TICK, until
 
 if TYPE_CHECKING:
-    from rosasync.testing import FakeGraph
+    from tests.support.fake_graph import FakeGraph
 
 
 class TestFaults:

@@ -24,9 +24,9 @@ from rosasync import (
     SessionClosed,
     UsageError,
 )
-from rosasync.testing import FakeGraph
 from tests.support.checks import assert_clean, check_call
 from tests.support.echo import ECHO, answer_to, request_of
+from tests.support.fake_graph import FakeGraph
 from tests.support.flood import flooding
 from tests.support.times import LIMIT, TICK, until
 

@@ -21,10 +21,10 @@ from rosasync import (
 )
 from rosasync._core.ports import TopicQos
 from rosasync._status.wire import Outcome, Report, process_of, report_topic
-from rosasync.testing import FakeGraph
 from tests.conftest import Bridge
 from tests.support.clients import ClientProcess
 from tests.support.echo import ECHO, answer_to, request_of
+from tests.support.fake_graph import FakeGraph
 from tests.support.serving import AnyCall, Gate, Holder, ask, echo_call, echo_of
 from tests.support.times import LIMIT, until
 

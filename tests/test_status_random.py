@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from rosasync import HandlerFailed, Limits, ServerGone, ServerOverloaded, to_message
 from rosasync._core.ports import TopicQos
 from rosasync._status.wire import Outcome, Report, process_of, report_topic
-from rosasync.testing import FakeGraph
 from tests.support.echo import ECHO, answer_to, request_of
+from tests.support.fake_graph import FakeGraph
 from tests.support.serving import Holder, echo_of
 
 CALLS = 4

@@ -134,9 +134,9 @@ def test_a_plain_fixture_is_told_to_be_async(project: Path) -> None:
 
 def test_a_session_of_another_loop_is_told_apart_by_its_scope(project: Path) -> None:
     (project / "test_other.py").write_text(
-        "import pytest\nfrom rosasync.testing import FakeGraph\n"
+        "import pytest\nfrom rosasync.testing import Graph\n"
         "@pytest.fixture\nasync def session():\n"
-        "    async with FakeGraph().session() as session:\n        yield session\n"
+        "    async with Graph() as graph, graph.session() as session:\n        yield session\n"
         "@pytest.mark.asyncio(loop_scope='session')\nasync def test_it(session):\n"
         "    await session.call('std_srvs/srv/Empty', '/x')\n"
     )

@@ -24,8 +24,8 @@ from rosasync import (
 from rosasync.behaviours import CallService, WaitForService
 from rosasync.lifecycle import LifecycleClient, TransitionTimeout
 from rosasync.parameters import ParameterClient
-from rosasync.testing import FakeGraph
 from tests.support.echo import ECHO, service_class
+from tests.support.fake_graph import FakeGraph, FakeServer
 from tests.support.times import LIMIT, TICK, until
 
 ABSENT, SILENT = "/absent", "/silent"
@@ -232,6 +232,7 @@ async def test_without_any_time_left_nothing_is_sent(
     graph: FakeGraph, way: Way, error: type[CallError], timeout: float
 ) -> None:
     (server,) = graph.servers
+    assert isinstance(server, FakeServer)
     async with graph.session() as session, asyncio.timeout(LIMIT):
         with pytest.raises((error, TransitionTimeout)):
             await way(session, timeout=timeout)

@@ -30,8 +30,9 @@ from rosasync import (
     Trace,
     TracedCall,
 )
-from rosasync.testing import FakeGraph, Graph
+from rosasync.testing import Graph
 from tests.support.echo import ECHO, answer_to, request_of
+from tests.support.fake_graph import FakeGraph
 from tests.support.serving import (
     FORMS,
     AnyCall,

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 if TYPE_CHECKING:
-    from rosasync.testing import FakeGraph, Graph, VirtualClock
+    from rosasync.testing import Graph, VirtualClock
 
-__all__ = ["fake_graph", "ros_domain", "ros_graph", "virtual_clock"]
+__all__ = ["ros_domain", "ros_graph", "virtual_clock"]
 
 REAL_SETTLE = 0.1
 """Seconds for which a virtual clock waits for responses on real ROS, before each step."""
@@ -78,14 +78,6 @@ def pytest_configure(config: pytest.Config) -> None:
         "rosasync(strict=True): whether ros_graph fails a test that calls a service without a "
         "server, or never calls a server",
     )
-
-
-@pytest.fixture
-def fake_graph() -> FakeGraph:
-    """An empty graph in memory, for tests of rosasync itself."""
-    from rosasync.testing.graph import FakeGraph
-
-    return FakeGraph()
 
 
 @pytest.fixture(scope="session")

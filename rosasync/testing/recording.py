@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Any, Self
 from rosasync._core.safe_yaml import YamlError, load, read_bytes
 from rosasync._ros.messages import to_dict, to_message
 from rosasync._ros.types import service_type, type_name
-from rosasync.testing.hooks import GraphSession, Hooks
+from rosasync.testing._hooks import GraphSession, Hooks
 
 if TYPE_CHECKING:
     from rosasync._core.ports import ClientPort, Deliver, Service
     from rosasync.session import Session
-    from rosasync.testing.hooks import OpenClient
+    from rosasync.testing._hooks import OpenClient
 
 __all__ = ["RecordedCall", "Recording"]
 

@@ -10,8 +10,8 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Literal, Self, overload
 
 from rosasync.errors import UsageError
-from rosasync.testing.graph import FakeGraph
-from rosasync.testing.hooks import GraphSession, Hooks
+from rosasync.testing._hooks import GraphSession, Hooks
+from rosasync.testing._memory.graph import MemoryGraph
 from rosasync.testing.stub import STUB, Answer, StubServer
 from rosasync.testing.stub_action import STUB as STUB_ACTION
 from rosasync.testing.stub_action import GoalAnswer, StubActionServer
@@ -78,7 +78,7 @@ class Graph:
         self.servers: list[StubServer[Any, Any]] = []
         self.action_servers: list[StubActionServer[Any, Any, Any]] = []
         self.unexpected: list[str] = []
-        self._fake = FakeGraph() if kind == "memory" else None
+        self._memory = MemoryGraph() if kind == "memory" else None
         self._hooks = Hooks()
         self._stubs: Session | None = None
 
@@ -89,11 +89,11 @@ class Graph:
             ImportError: rclpy is not installed, for real ROS.
             RuntimeError: all ROS domains are taken.
         """
-        if self._fake is None:
+        if self._memory is None:
             from rosasync._ros.domain import isolate_once
 
             isolate_once()
-        self._stubs = await GraphSession(self._hooks, self._fake, "stubs").__aenter__()
+        self._stubs = await GraphSession(self._hooks, self._memory, "stubs").__aenter__()
         return self
 
     async def __aexit__(
@@ -125,13 +125,13 @@ class Graph:
             recording: records the calls of the session.
             options: those of `rosasync.Session`.
         """
-        if self._fake is None and isinstance(node, str):
+        if self._memory is None and isinstance(node, str):
             # One participant of the middleware: its clients and servers match at once.
             options.setdefault("context", self._open().node.context)
         hooks = Hooks(on_missing=self._missing)
         if recording is not None:
             hooks.wrap_client = recording.wrap_client
-        return GraphSession(hooks, self._fake, node, **options)
+        return GraphSession(hooks, self._memory, node, **options)
 
     @overload
     def serve(

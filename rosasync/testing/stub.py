@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Generic, Self, TypeAlias
 
 from rosasync._ros.messages import to_dict, to_message
 from rosasync._ros.types import service_type
-from rosasync.testing.faults import Faults, FaultyService, StubCall, set_in_block
-from rosasync.testing.matching import (
+from rosasync.testing._faults import Faults, FaultyService, StubCall, set_in_block
+from rosasync.testing._matching import (
     check_fields,
     count,
     describe,
@@ -19,7 +19,7 @@ from rosasync.testing.matching import (
     explain_mismatch,
     matches,
 )
-from rosasync.testing.rules import Match, Rule
+from rosasync.testing._rules import Match, Rule
 from rosasync.typing import RequestT, ResponseT
 
 if TYPE_CHECKING:

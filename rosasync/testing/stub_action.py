@@ -15,9 +15,9 @@ from rosasync._ros.action_types import action_type
 from rosasync._ros.messages import make_message, to_dict
 from rosasync.errors import GoalAborted, GoalCanceled, GoalRejected, SessionClosed
 from rosasync.options import check_seconds
-from rosasync.testing.faults import Faults, FaultyService, OpenService, StubCall, set_in_block
-from rosasync.testing.matching import check_fields, count, describe, explain_mismatch
-from rosasync.testing.rules import Match, Rule, take_answer
+from rosasync.testing._faults import Faults, FaultyService, OpenService, StubCall, set_in_block
+from rosasync.testing._matching import check_fields, count, describe, explain_mismatch
+from rosasync.testing._rules import Match, Rule, take_answer
 from rosasync.typing import FeedbackT, GoalT, ResultT
 
 if TYPE_CHECKING:

@@ -7,11 +7,12 @@ from typing import Any
 import pytest
 
 from rosasync._client.call_errors import SHARED, CallErrors
-from rosasync.testing import FakeGraph, FakeNode
+from rosasync.testing._memory.graph import MemoryNode
+from tests.support.fake_graph import FakeGraph
 from tests.support.plain import Echo
 
 
-class SlowNode(FakeNode):
+class SlowNode(MemoryNode):
     """A node in a graph so large that its description takes 8 ms."""
 
     def __init__(self, now: list[float]) -> None:

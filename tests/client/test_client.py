@@ -17,7 +17,9 @@ from rosasync._client.sent import Sent
 from rosasync._core.aio import Deadlines, Expired
 from rosasync._status.listener import Listener
 from rosasync.statistics import ServiceKey
-from rosasync.testing import FakeClient, FakeGraph, FakeNode
+from rosasync.testing._memory.graph import MemoryNode, new_identity
+from rosasync.testing._memory.services import MemoryClient
+from tests.support.fake_graph import FakeGraph
 from tests.support.nodes import reports
 from tests.support.times import TICK, until
 
@@ -26,7 +28,7 @@ class ClientUnderTest:
     """A client on a fake port, and a dispatch that sends again at once."""
 
     def __init__(self, **limits: Any) -> None:
-        self.node = FakeNode(FakeGraph())
+        self.node = MemoryNode(FakeGraph())
         self.counts = Counts()
         self.queue: list[object] = []
         self.passed: list[object] = []
@@ -39,9 +41,9 @@ class ClientUnderTest:
         self.budget = RetryBudget(self.counts, asyncio.get_running_loop().time)
         self._deadlines = Deadlines()
 
-    def _open(self, deliver: Callable[[int, Any], None]) -> FakeClient:
-        self.port = FakeClient(self.node, ServiceKey("/echo", ""), deliver)
-        self.node.clients.append(self.port)
+    def _open(self, deliver: Callable[[int, Any], None]) -> MemoryClient:
+        key, identity = ServiceKey("/echo", ""), new_identity(self.node.process)
+        self.port = MemoryClient(self.node.graph, key, deliver, identity)
         return self.port
 
     # The owner of the client.

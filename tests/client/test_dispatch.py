@@ -12,7 +12,7 @@ import pytest
 
 from rosasync import Limits, QueueTimeout, ResponseTimeout, Retry, Session
 from rosasync._client.client import Client
-from rosasync.testing import FakeGraph
+from tests.support.fake_graph import FakeGraph
 from tests.support.overload import Outcome, SerialServer, VirtualLoop, keep_calling, offer
 from tests.support.plain import Echo
 

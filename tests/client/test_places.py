@@ -13,7 +13,8 @@ from tests.support.plain import Echo, echo
 from tests.support.times import LIMIT, TICK, until
 
 if TYPE_CHECKING:
-    from rosasync.testing import FakeClient, FakeGraph
+    from rosasync.testing._memory.services import MemoryClient
+    from tests.support.fake_graph import FakeGraph
 
 LONG = 1000.0
 """Seconds of grace: no place of these tests comes back with its end."""
@@ -42,7 +43,7 @@ async def abandon(session: Session, requests: int) -> None:
     assert session.pool.statistics().abandoned == requests
 
 
-def the_port(graph: FakeGraph) -> FakeClient:
+def the_port(graph: FakeGraph) -> MemoryClient:
     ((client,),) = ([*node.clients] for node in graph.nodes)
     return client
 

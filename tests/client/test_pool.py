@@ -27,7 +27,9 @@ from rosasync import (
     SessionClosed,
     UsageError,
 )
-from rosasync.testing import FakeClient, FakeGraph, FakeNode
+from rosasync.testing._memory.graph import MemoryNode
+from rosasync.testing._memory.services import MemoryClient
+from tests.support.fake_graph import FakeGraph
 from tests.support.plain import Echo, echo
 from tests.support.times import TICK, until
 
@@ -45,7 +47,7 @@ async def ask(session: Session, value: object, **options: Any) -> object:
     return response.value
 
 
-def clients(graph: FakeGraph) -> list[FakeClient]:
+def clients(graph: FakeGraph) -> list[MemoryClient]:
     return [client for node in graph.nodes for client in node.clients]
 
 
@@ -488,7 +490,7 @@ class TestEndings:
         fake_graph.serve(Echo, "/echo", echo)
         async with opened(fake_graph, Limits(in_flight=1)) as session:
             node = session.node
-            assert isinstance(node, FakeNode)
+            assert isinstance(node, MemoryNode)
             with fake_graph.hold_requests():
                 calls = [
                     ask(session, "in flight"),
@@ -518,7 +520,7 @@ class TestEndings:
             task = asyncio.create_task(ask(session, 1, timeout=None))
             await until(lambda: session.pool.statistics().waiting == 1)
             node = session.node
-            assert isinstance(node, FakeNode)
+            assert isinstance(node, MemoryNode)
             node.up = False
             with pytest.raises(ContextShutdown):
                 await task

@@ -21,15 +21,15 @@ from rosasync._client import response_times, retry
 from rosasync._client.counts import Counts
 from rosasync._client.matching import GONE_DELAY
 from rosasync._client.retry import Action, Plan, RetryBudget
-from rosasync.testing import FakeNode
+from rosasync.testing._memory.graph import MemoryNode
 from tests.support.echo import ECHO, answer_to, request_of
 from tests.support.plain import Echo, echo
 from tests.support.servers import ServerProcess
 from tests.support.times import LIMIT, TICK, until
 
 if TYPE_CHECKING:
-    from rosasync.testing import FakeGraph, FakeServer
     from tests.conftest import Bridge
+    from tests.support.fake_graph import FakeGraph, FakeServer
 
 NEVER = 100 * LIMIT
 """Seconds until a timer that is not meant to run out."""
@@ -566,7 +566,7 @@ class TestNextServer:
                 await session.aclose()
             elif how == "shut down":
                 node = session.node
-                assert isinstance(node, FakeNode)
+                assert isinstance(node, MemoryNode)
                 node.shutdown()
             else:
                 task.cancel()

@@ -24,7 +24,8 @@ from rosasync import (
 )
 from rosasync._client.graph_watch import POLL_MAX
 from rosasync._core.ports import PortDestroyed
-from rosasync.testing import FakeClient, FakeGraph
+from rosasync.testing._memory.services import MemoryClient
+from tests.support.fake_graph import FakeGraph
 from tests.support.plain import Echo, echo
 from tests.support.times import LIMIT, TICK, until
 
@@ -34,7 +35,7 @@ async def ask(session: Session, value: object, **options: Any) -> object:
     return response.value
 
 
-def the_client(graph: FakeGraph) -> FakeClient:
+def the_client(graph: FakeGraph) -> MemoryClient:
     ((client,),) = ([*node.clients] for node in graph.nodes)
     return client
 
@@ -312,7 +313,7 @@ async def test_a_match_without_an_event_is_polled_for_at_short_intervals(
     async with graph.session() as session:
         # The poll that finds the match is the second in a row.
         monkeypatch.setattr(loop, "call_later", spy)
-        monkeypatch.setattr(FakeClient, "ready", lambda client: len(delays) > 4)
+        monkeypatch.setattr(MemoryClient, "ready", lambda client: len(delays) > 4)
         assert await ask(session, 1) == 1
         waits = delays[:5]
     # The first starts with the call, and the creation of the client replaces it at once.
@@ -327,13 +328,13 @@ async def test_a_poll_that_fails_is_not_the_last(
     loop.set_exception_handler(lambda _, context: failures.append(context))
     fake_graph.serve(Echo, "/echo", echo)
 
-    def ready(client: FakeClient) -> bool:
+    def ready(client: MemoryClient) -> bool:
         if len(failures) < 3:
             raise RosasyncError("rclpy failed")
         return True
 
     async with fake_graph.session() as session:
-        monkeypatch.setattr(FakeClient, "ready", ready)
+        monkeypatch.setattr(MemoryClient, "ready", ready)
         assert await ask(session, 1, timeout=LIMIT) == 1
     assert len(failures) == 3
 

@@ -15,7 +15,8 @@ from rosasync import Limits, Retry, RosasyncError, Session
 from rosasync._client import response_times
 from rosasync._client.service import ServicePool
 from rosasync._core.ports import PortDestroyed
-from rosasync.testing import FakeClient, FakeGraph, FakeServer
+from rosasync.testing._memory.services import MemoryClient
+from tests.support.fake_graph import FakeGraph, FakeServer
 from tests.support.places import check_places
 from tests.support.times import TICK, until
 
@@ -262,14 +263,14 @@ async def test_random_operations_leave_nothing_behind(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     sent: dict[int, None] = {}
-    send = FakeClient.send
+    send = MemoryClient.send
 
-    def record(client: FakeClient, request: Echo.Request) -> int:
+    def record(client: MemoryClient, request: Echo.Request) -> int:
         assert request.value is not None
         sent.setdefault(request.value)
         return send(client, request)
 
-    monkeypatch.setattr(FakeClient, "send", record)
+    monkeypatch.setattr(MemoryClient, "send", record)
     monkeypatch.setattr(response_times, "PATIENCE_INITIAL", 2 * SHORT)
     monkeypatch.setattr(response_times, "PATIENCE_MIN", SHORT)
     for seed in seeds:

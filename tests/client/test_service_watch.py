@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from rosasync import InvalidServiceName, ServiceState, Session, SessionClosed
-from rosasync.testing import FakeGraph
 from tests.support.echo import ECHO
+from tests.support.fake_graph import FakeGraph
 from tests.support.plain import Echo, echo
 from tests.support.times import LIMIT
 

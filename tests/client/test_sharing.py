@@ -15,8 +15,8 @@ from tests.support.servers import ServerProcess
 from tests.support.times import LIMIT, TICK, until
 
 if TYPE_CHECKING:
-    from rosasync.testing import FakeGraph
     from tests.conftest import Bridge
+    from tests.support.fake_graph import FakeGraph
 
 
 def in_flight(session: Session) -> int:

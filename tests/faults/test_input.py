@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from std_srvs.srv import SetBool
 
 from rosasync import CallError, InvalidServiceName, Limits, PoolFull, Retry, Session, UsageError
-from rosasync.testing import FakeGraph
+from tests.support.fake_graph import FakeGraph
 from tests.support.times import LIMIT, TICK
 
 REFUSALS = (TypeError, ValueError, UsageError)

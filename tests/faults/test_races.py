@@ -20,7 +20,7 @@ from hypothesis.stateful import run_state_machine_as_test as run_machine
 from rosasync import Limits, Retry, RosasyncError
 from rosasync._client.client import Client
 from rosasync._client.service import ServicePool
-from rosasync.testing import FakeGraph, FakeServer
+from tests.support.fake_graph import FakeGraph, FakeServer
 from tests.support.overload import VirtualLoop
 from tests.support.places import check_places
 from tests.support.plain import Echo, echo
@@ -46,7 +46,7 @@ class ManualServer(FakeServer):
 
     def answer(self, place: int) -> None:
         client, number, request = self.received.pop(place % len(self.received))
-        client.later(0.0, number, echo(request))
+        self.graph.carry_response(client, number, echo(request))
 
 
 SECONDS = st.sampled_from([None, 0.0, 0.5, 2.0, 10.0])

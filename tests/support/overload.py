@@ -13,7 +13,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from rosasync import CallError, Session
-from rosasync.testing import FakeClient, FakeGraph, FakeServer
+from rosasync.testing._memory.services import MemoryClient
+from tests.support.fake_graph import FakeGraph, FakeServer
 from tests.support.plain import Echo, echo
 
 __all__ = ["Outcome", "SerialServer", "VirtualLoop", "keep_calling", "offer"]
@@ -58,10 +59,9 @@ class SerialServer(FakeServer):
         self.served = 0
         self.spread = spread
         self._working = False
-        graph.servers.append(self)
-        graph.changed()
+        self.enter()
 
-    def receive(self, client: FakeClient, number: int, request: Any) -> None:
+    def receive(self, client: MemoryClient, number: int, request: Any) -> None:
         self._queue.append((client, number, request))
         if len(self._queue) > self.depth:
             self._queue.popleft()
@@ -76,11 +76,11 @@ class SerialServer(FakeServer):
                 seconds = self.spread.expovariate(1 / seconds)
             asyncio.get_running_loop().call_later(seconds, self._end, self._queue.popleft())
 
-    def _end(self, item: tuple[FakeClient, int, Any]) -> None:
+    def _end(self, item: tuple[MemoryClient, int, Any]) -> None:
         client, number, request = item
         self.served += 1
         self._working = False
-        client.later(0.0, number, echo(request))
+        self.graph.carry_response(client, number, echo(request))
         self._begin()
 
 

@@ -13,7 +13,8 @@ from test_msgs.action import Fibonacci
 
 from rosasync import GoalStatus
 from rosasync._core.ports import TopicQos, Undeliverable
-from rosasync.testing import FakeGraph, FakeNode
+from rosasync.testing._memory.graph import MemoryNode
+from tests.support.fake_graph import FakeGraph
 
 __all__ = ["ScriptedAction"]
 
@@ -40,7 +41,7 @@ class ScriptedAction:
         self.sends: list[tuple[Any, Any]] = []
         self.cancels: list[tuple[Any, Any]] = []
         self.asks: list[tuple[Any, Any]] = []
-        self._node = FakeNode(graph)
+        self._node = MemoryNode(graph)
         self._action = self._node.describe_action(Fibonacci, name)
         self._feedback_numbers = itertools.count()
         self._loop = asyncio.get_running_loop()

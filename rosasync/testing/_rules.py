@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Generic, TypeAlias, TypeVar
 
 from rosasync._ros.messages import to_dict
-from rosasync.testing.matching import matches
+from rosasync.testing._matching import matches
 
 __all__ = ["Match", "Rule", "take_answer"]
 

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from rosasync._core.gateway import LoopGateway
     from rosasync._core.ports import ClientPort, Deliver, DeliverRequest, Service, ServicePort
     from rosasync.options import SessionOptions
-    from rosasync.testing.hooks import Hooks
+    from rosasync.testing._hooks import Hooks
 
 __all__ = ["HookedRosNode"]
 

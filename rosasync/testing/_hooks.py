@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from rosasync.session import Session
-from rosasync.testing.graph import FakeGraph, FakeNode
+from rosasync.testing._memory.graph import MemoryNode
 
 if TYPE_CHECKING:
     from rosasync._core.gateway import LoopGateway
@@ -20,9 +20,10 @@ if TYPE_CHECKING:
         Service,
         ServicePort,
     )
-    from rosasync.testing.faults import OpenService
+    from rosasync.testing._faults import OpenService
+    from rosasync.testing._memory.graph import MemoryGraph
 
-__all__ = ["GraphSession", "HookedFakeNode", "Hooks", "OpenClient"]
+__all__ = ["GraphSession", "HookedMemoryNode", "Hooks", "OpenClient"]
 
 OpenClient: TypeAlias = "Callable[[Service, Deliver], ClientPort]"
 """Opens a client's port."""
@@ -67,48 +68,47 @@ class GraphSession(Session):
 
     Args:
         hooks: what its node calls.
-        fake: the graph in memory; None for real ROS.
+        memory: the graph in memory; None for real ROS.
         node: the node's name, or on real ROS an rclpy node.
         options: those of `rosasync.Session`.
     """
 
-    def __init__(self, hooks: Hooks, fake: FakeGraph | None, node: Any, **options: Any) -> None:
+    def __init__(self, hooks: Hooks, memory: MemoryGraph | None, node: Any, **options: Any) -> None:
         super().__init__(node, **options)
         self._hooks = hooks
-        self._fake = fake
+        self._memory = memory
 
     async def _load(self) -> None:
         # A graph in memory needs no rclpy.
-        if self._fake is None:
+        if self._memory is None:
             await super()._load()
 
     def _open_node(
         self, gateway: LoopGateway, on_graph: Callable[[], None], on_shutdown: Callable[[], None]
     ) -> NodePort:
-        if self._fake is not None:
+        if self._memory is not None:
             name = str(self._options.node)
-            return HookedFakeNode(self._fake, self._hooks, name, on_graph, on_shutdown)
+            return HookedMemoryNode(self._memory, self._hooks, name, on_graph, on_shutdown)
         # Only now, because a graph in memory needs no rclpy.
-        module = importlib.import_module("rosasync.testing.ros_node")
+        module = importlib.import_module("rosasync.testing._ros_node")
         node: NodePort = module.HookedRosNode(
             self._options, gateway, on_graph, on_shutdown, self._hooks
         )
         return node
 
 
-class HookedFakeNode(FakeNode):
+class HookedMemoryNode(MemoryNode):
     """A node in memory, with hooks."""
 
     def __init__(
         self,
-        graph: FakeGraph,
+        graph: MemoryGraph,
         hooks: Hooks,
         name: str,
         on_graph: Callable[[], None],
         on_shutdown: Callable[[], None],
     ) -> None:
-        super().__init__(graph, on_graph, on_shutdown)
-        self.name = name
+        super().__init__(graph, on_graph, on_shutdown, name)
         self._hooks = hooks
 
     def open_client(self, service: Service, deliver: Deliver) -> Any:

@@ -1,0 +1,1 @@
+"""The middleware in memory behind `rosasync.testing.Graph`."""
