@@ -32,7 +32,7 @@ from std_msgs.msg import Bool, ByteMultiArray, Int8, Int64, String, UInt8MultiAr
 from std_srvs.srv import Empty, SetBool, Trigger
 
 from rosasync._ros.messages import make_message, to_dict, to_message
-from rosasync._ros.types import service_type, type_name
+from rosasync._ros.types import action_type, service_type, type_name
 
 idl: Any = importlib.import_module("rosidl_parser.definition")
 shapes: Any = importlib.import_module("shape_msgs.msg")
@@ -105,6 +105,23 @@ def test_unknown_name_says_what_is_there(name: str, message: str) -> None:
     with pytest.raises(ValueError, match=message) as caught:
         service_type(name)
     assert repr(name) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("given_type", "error", "message"),
+    [
+        ("test_msgs/action/Quux", ValueError, "no such action in test_msgs; it has Fibonacci, "),
+        ("test_msgs/srv/Fibonacci", ValueError, "expected 'package/action/Type', such as"),
+        ("std_srvs/action/SetBool", ValueError, "the package 'std_srvs' has no actions"),
+        (SetBool, TypeError, "std_srvs/srv/SetBool is not an action: it has no Goal, Result and"),
+        (5, TypeError, "expected an action class, or its name such as .*, got int 5"),
+    ],
+)
+def test_action_types_have_the_same_errors(
+    given_type: Any, error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        action_type(given_type)
 
 
 def test_broken_package_is_not_called_missing() -> None:

@@ -12,7 +12,7 @@ import rosasync
 from rosasync._cli.completion import complete_action_names, complete_action_types
 from rosasync._cli.errors import CliError, Code
 from rosasync._cli.graph import POLL, explain_type, resolve
-from rosasync._ros.action_types import action_type
+from rosasync._ros.types import action_type
 
 if TYPE_CHECKING:
     from rosasync._ros.inspect import Endpoint

@@ -13,10 +13,9 @@ from rclpy.validate_full_topic_name import validate_full_topic_name
 from rclpy.validate_topic_name import validate_topic_name
 
 from rosasync._core.ports import Action, Service
-from rosasync._ros.action_types import action_type
 from rosasync._ros.checks import checker
 from rosasync._ros.failures import reason_of, uses_node
-from rosasync._ros.types import service_type, type_name
+from rosasync._ros.types import action_type, service_type, type_name
 from rosasync.errors import InvalidServiceName
 from rosasync.statistics import ServiceKey
 

@@ -12,15 +12,62 @@ import importlib
 import re
 import reprlib
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
-__all__ = ["Unquoted", "hint", "load_definitions", "service_type", "shown", "type_name"]
+__all__ = ["Unquoted", "action_type", "hint", "service_type", "shown", "type_name"]
 
 
 class Unquoted(str):
     """A scalar of YAML without quotes, whose type is that of its field."""
 
     __slots__ = ()
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """Services or actions: how their classes are named, and what tells that a class is one."""
+
+    noun: str
+    a: str
+    folder: str
+    parts: tuple[str, ...]
+    shape: str
+    example: str
+
+    def fits(self, candidate: object) -> bool:
+        """Return whether this is a class of the kind."""
+        return isinstance(candidate, type) and all(
+            isinstance(getattr(candidate, part, None), type) for part in self.parts
+        )
+
+    def check(self, wanted: object) -> None:
+        """Raise `TypeError` unless this is a class of the kind."""
+        if not isinstance(wanted, type):
+            raise TypeError(
+                f"expected {self.a} class, or its name such as {self.example!r}, "
+                f"got {shown(wanted)}"
+            )
+        if not self.fits(wanted):
+            raise TypeError(f"{type_name(wanted)} is not {self.a}: it has no {self.shape}")
+
+
+_SERVICE = _Kind(
+    "service",
+    "a service",
+    "srv",
+    ("Request", "Response"),
+    "Request and Response",
+    "std_srvs/srv/SetBool",
+)
+_ACTION = _Kind(
+    "action",
+    "an action",
+    "action",
+    ("Goal", "Result", "Feedback", "Impl"),
+    "Goal, Result and Feedback",
+    "nav2_msgs/action/NavigateToPose",
+)
 
 
 def service_type(srv_type: type[Any] | str) -> type[Any]:
@@ -34,15 +81,25 @@ def service_type(srv_type: type[Any] | str) -> type[Any]:
         ValueError: the name is malformed, or no such service is installed.
     """
     if isinstance(srv_type, str):
-        return _service_named(srv_type)
-    if not isinstance(srv_type, type):
-        raise TypeError(
-            "expected a service class, or its name such as 'std_srvs/srv/SetBool', "
-            f"got {shown(srv_type)}"
-        )
-    if not _is_service(srv_type):
-        raise TypeError(f"{type_name(srv_type)} is not a service: it has no Request and Response")
+        return _named(_SERVICE, srv_type)
+    _SERVICE.check(srv_type)
     return srv_type
+
+
+def action_type(wanted: type[Any] | str) -> type[Any]:
+    """Resolve an action class from a class or a name.
+
+    Args:
+        wanted: an action class, or its name, ``"test_msgs/action/Fibonacci"``.
+
+    Raises:
+        TypeError: neither an action class nor a string.
+        ValueError: the name is malformed, or no such action is installed.
+    """
+    if isinstance(wanted, str):
+        return _named(_ACTION, wanted)
+    _ACTION.check(wanted)
+    return wanted
 
 
 def type_name(srv_type: type[Any]) -> str:
@@ -71,61 +128,38 @@ def shown(value: object) -> str:
     return f"{name} {reprlib.repr(value)}" if isinstance(value, str | bytes | float | int) else name
 
 
-_SERVICE_NAME = re.compile(r"([a-z]\w*)/srv/([a-z]\w*)", re.ASCII | re.IGNORECASE)
-
-
 @functools.cache
-def _service_named(name: str) -> type[Any]:
-    match = _SERVICE_NAME.fullmatch(name)
+def _named(kind: _Kind, name: str) -> type[Any]:
+    match = re.fullmatch(rf"([a-z]\w*)/{kind.folder}/([a-z]\w*)", name, re.ASCII | re.IGNORECASE)
     if match is None:
         raise ValueError(
-            f"{name!r} does not name a service type: expected 'package/srv/Type', "
-            "such as 'std_srvs/srv/SetBool'"
+            f"{name!r} does not name {kind.a} type: expected 'package/{kind.folder}/Type', "
+            f"such as {kind.example!r}"
         )
     package, wanted = match.groups()
-    services: dict[str, type[Any]] = {
-        key: found
-        for key, found in load_definitions(package, "srv", "services", name).items()
-        if _is_service(found)
+    known: dict[str, type[Any]] = {
+        key: found for key, found in _load(kind, package, name).items() if kind.fits(found)
     }
-    if wanted not in services:
-        similar = difflib.get_close_matches(wanted, services, n=1)
-        names = hint([f"{package}/srv/{found}" for found in similar], services)
-        raise ValueError(f"{name!r}: no such service in {package}{names}")
-    return services[wanted]
+    if wanted not in known:
+        similar = difflib.get_close_matches(wanted, known, n=1)
+        names = hint([f"{package}/{kind.folder}/{found}" for found in similar], known)
+        raise ValueError(f"{name!r}: no such {kind.noun} in {package}{names}")
+    return known[wanted]
 
 
-def load_definitions(package: str, kind: str, noun: str, name: str) -> dict[str, Any]:
-    """Import what a package defines of one kind.
-
-    Args:
-        package: the package.
-        kind: its module, ``srv`` or ``action``.
-        noun: what the module has, for the errors.
-        name: the name of the type that is looked for, for the errors.
-
-    Raises:
-        ValueError: the package is not installed, or has none.
-    """
+def _load(kind: _Kind, package: str, name: str) -> dict[str, Any]:
+    """Import what a package defines of one kind."""
     try:
-        return vars(importlib.import_module(f"{package}.{kind}"))
+        return vars(importlib.import_module(f"{package}.{kind.folder}"))
     except ModuleNotFoundError as error:
         if error.name == package:
             raise ValueError(
                 f"{name!r}: the package {package!r} is not installed for this Python, "
                 "or its workspace is not sourced"
             ) from None
-        if error.name == f"{package}.{kind}":
-            raise ValueError(f"{name!r}: the package {package!r} has no {noun}") from None
+        if error.name == f"{package}.{kind.folder}":
+            raise ValueError(f"{name!r}: the package {package!r} has no {kind.noun}s") from None
         raise
-
-
-def _is_service(candidate: object) -> bool:
-    return (
-        isinstance(candidate, type)
-        and isinstance(getattr(candidate, "Request", None), type)
-        and isinstance(getattr(candidate, "Response", None), type)
-    )
 
 
 def hint(similar: Sequence[str], all_names: Iterable[str]) -> str:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Generic, Self, TypeAlias
 from uuid import UUID
 
 from rosasync._actions.status import GoalStatus
-from rosasync._ros.action_types import action_type
+from rosasync._ros.types import action_type
 from rosasync._ros.messages import make_message, to_dict
 from rosasync.errors import GoalAborted, GoalCanceled, GoalRejected, SessionClosed
 from rosasync.options import check_seconds

@@ -124,7 +124,7 @@ class _Server:
         from rclpy.action import ActionServer, CancelResponse, GoalResponse
         from rclpy.callback_groups import ReentrantCallbackGroup
 
-        from rosasync._ros.action_types import action_type
+        from rosasync._ros.types import action_type
 
         self.options = options
         self.type = action_type(options["action_type"])

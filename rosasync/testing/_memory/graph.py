@@ -10,10 +10,9 @@ from collections.abc import Callable, Hashable
 from typing import TYPE_CHECKING, Any
 
 from rosasync._core.ports import Action, Service
-from rosasync._ros.action_types import action_type
 from rosasync._ros.checks import checker
 from rosasync._ros.messages import make_message
-from rosasync._ros.types import service_type, type_name
+from rosasync._ros.types import action_type, service_type, type_name
 from rosasync.errors import InvalidServiceName
 from rosasync.statistics import ServiceKey
 from rosasync.testing._memory.services import MemoryClient, MemoryServer, MemoryService
