@@ -67,13 +67,20 @@ def difference(expected: Any, actual: Any) -> str:
 
 
 def explain_mismatch(
-    expected: Sequence[Mapping[str, Any]], requests: Sequence[Mapping[str, Any]]
+    message_type: type[Any],
+    expected: Sequence[Mapping[str, Any]],
+    requests: Sequence[Mapping[str, Any]],
 ) -> str | None:
     """Compare all requests, in order; of each, only the fields that are expected count.
 
     Returns:
         Their difference; None if they match.
+
+    Raises:
+        ValueError: the message type has no field that is expected.
     """
+    for fields in expected:
+        check_fields(message_type, fields)
     if len(expected) == len(requests) and all(map(matches, expected, requests)):
         return None
     shown = [

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Generic, TypeAlias, TypeVar
 
 from rosasync._ros.messages import to_dict
-from rosasync.testing._matching import matches
+from rosasync.testing._matching import check_fields, matches
 
-__all__ = ["Match", "Rule", "take_answer"]
+__all__ = ["Match", "Rules"]
+
+logger = logging.getLogger("rosasync")
 
 Match: TypeAlias = Mapping[str, Any] | Callable[[Any], bool] | None
 """Which requests: a mapping of the fields that count, a function of the request, None for all."""
@@ -25,11 +28,6 @@ class Rule(Generic[AnswerT]):
     answers: list[AnswerT]
     repeated: bool
 
-    @classmethod
-    def of(cls, match: Match, answers: list[AnswerT]) -> Rule[AnswerT]:
-        """Make a rule of one answer, or of several."""
-        return cls(match, answers, repeated=len(answers) == 1)
-
     def fits(self, request: Any) -> bool:
         """Return whether the rule matches a request, and has an answer left."""
         if not self.answers:
@@ -43,7 +41,40 @@ class Rule(Generic[AnswerT]):
         return self.answers[0] if self.repeated else self.answers.pop(0)
 
 
-def take_answer(rules: list[Rule[AnswerT]], request: Any) -> AnswerT | None:
-    """Return the next answer of the first rule that fits a request; None if there is none."""
-    rule = next((rule for rule in rules if rule.fits(request)), None)
-    return None if rule is None else rule.take()
+class Rules(Generic[AnswerT]):
+    """The rules of one stub.
+
+    Args:
+        request_type: the message class of the requests, or of the goals.
+        on_unexpected: called with a sentence if a request has no answer.
+    """
+
+    def __init__(self, request_type: type[Any], on_unexpected: Callable[[str], None]) -> None:
+        self._request_type = request_type
+        self._on_unexpected = on_unexpected
+        self._rules: list[Rule[AnswerT]] = []
+
+    def check(self, name: str, match: Match, answers: tuple[object, ...]) -> None:
+        """Check the arguments of a rule before its answers are prepared.
+
+        Raises:
+            ValueError: there is no answer, or the request has no such field.
+        """
+        if not answers:
+            raise ValueError(f"{name}: answer() takes at least one answer")
+        if isinstance(match, Mapping):
+            check_fields(self._request_type, match)
+
+    def add(self, match: Match, answers: list[AnswerT]) -> None:
+        """Add a rule behind the others."""
+        self._rules.append(Rule(match, answers, repeated=len(answers) == 1))
+
+    def take(self, name: str, request: Any) -> AnswerT | None:
+        """Return the next answer of the first rule that fits; if none does, report it."""
+        for rule in self._rules:
+            if rule.fits(request):
+                return rule.take()
+        problem = f"{name} has no answer left for {to_dict(request)}"
+        logger.warning("%s", problem)
+        self._on_unexpected(problem)
+        return None

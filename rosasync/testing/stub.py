@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from typing import TYPE_CHECKING, Any, Generic, Self, TypeAlias
 
 from rosasync._ros.messages import to_dict, to_message
 from rosasync._ros.types import service_type
+from rosasync.testing._arrivals import Arrivals
 from rosasync.testing._faults import Faults, FaultyService, StubCall, set_in_block
 from rosasync.testing._matching import (
     check_fields,
@@ -19,7 +19,7 @@ from rosasync.testing._matching import (
     explain_mismatch,
     matches,
 )
-from rosasync.testing._rules import Match, Rule
+from rosasync.testing._rules import Match, Rules
 from rosasync.typing import RequestT, ResponseT
 
 if TYPE_CHECKING:
@@ -31,8 +31,6 @@ __all__ = ["Answer", "Match", "StubCall", "StubServer"]
 Answer: TypeAlias = Any
 """A response message, a mapping of its fields, an exception that the handler raises, or None for no
 answer at all."""
-
-logger = logging.getLogger("rosasync")
 
 
 class StubServer(Generic[RequestT, ResponseT]):
@@ -63,10 +61,9 @@ class StubServer(Generic[RequestT, ResponseT]):
         self._handler = self._answer if handler is STUB else handler
         self._options = options
         self._open_server = open_server
-        self._on_unexpected = on_unexpected
-        self._rules: list[Rule[Answer]] = []
+        self._rules = Rules[Answer](self._type.Request, on_unexpected)
         self._faults = Faults()
-        self._changed = asyncio.Event()
+        self._arrivals = Arrivals()
         self._server = self._open()
 
     def __repr__(self) -> str:
@@ -121,12 +118,8 @@ class StubServer(Generic[RequestT, ResponseT]):
         Raises:
             TypeError, ValueError: an answer or a field does not fit the service type.
         """
-        if not answers:
-            raise ValueError(f"{self.srv_name}: answer() takes at least one answer")
-        if isinstance(match, Mapping):
-            check_fields(self._type.Request, match)
-        prepared = [self._prepare(answer) for answer in answers]
-        self._rules.append(Rule.of(match, prepared))
+        self._rules.check(self.srv_name, match, answers)
+        self._rules.add(match, [self._prepare(answer) for answer in answers])
         return self
 
     def _prepare(self, answer: Answer) -> Answer:
@@ -142,12 +135,7 @@ class StubServer(Generic[RequestT, ResponseT]):
         )
 
     def _answer(self, call: ServiceCall[Any, Any]) -> Any:
-        rule = next((rule for rule in self._rules if rule.fits(call.request)), None)
-        if rule is None:
-            problem = f"{self.srv_name} has no answer left for {to_dict(call.request)}"
-            logger.warning("%s", problem)
-            self._on_unexpected(problem)
-        answer = None if rule is None else rule.take()
+        answer = self._rules.take(self.srv_name, call.request)
         if answer is None:
             call.give_up("left unanswered by the test")
         elif isinstance(answer, (type, Exception)):
@@ -210,13 +198,8 @@ class StubServer(Generic[RequestT, ResponseT]):
         Raises:
             AssertionError: it has not, after ``timeout`` seconds.
         """
-        try:
-            async with asyncio.timeout(timeout):
-                while len(self.calls) < number:
-                    self._changed.clear()
-                    await self._changed.wait()
-        except TimeoutError:
-            raise self._failure(f"expected {count(number, 'call')} within {timeout:g} s") from None
+        if not await self._arrivals.wait_for(number, self.calls, timeout):
+            raise self._failure(f"expected {count(number, 'call')} within {timeout:g} s")
         return self.calls[:number]
 
     def assert_called(self, times: int | None = None) -> None:
@@ -259,9 +242,8 @@ class StubServer(Generic[RequestT, ResponseT]):
             ValueError: the request has no such field.
         """
         __tracebackhide__ = True
-        for fields in expected:
-            check_fields(self._type.Request, fields)
-        if (differences := explain_mismatch(expected, self.requests)) is not None:
+        differences = explain_mismatch(self._type.Request, expected, self.requests)
+        if differences is not None:
             raise self._failure(f"expected {count(len(expected), 'request')}", f"\n{differences}")
 
     def _failure(self, expected: str, more: str = "") -> AssertionError:
@@ -283,7 +265,7 @@ class StubServer(Generic[RequestT, ResponseT]):
 
     def _on_call(self, call: StubCall[RequestT, ResponseT]) -> None:
         self.calls.append(call)
-        self._changed.set()
+        self._arrivals.notify()
 
 
 STUB = object()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -11,13 +10,14 @@ from typing import TYPE_CHECKING, Any, Generic, Self, TypeAlias
 from uuid import UUID
 
 from rosasync._actions.status import GoalStatus
-from rosasync._ros.types import action_type
 from rosasync._ros.messages import make_message, to_dict
+from rosasync._ros.types import action_type
 from rosasync.errors import GoalAborted, GoalCanceled, GoalRejected, SessionClosed
 from rosasync.options import check_seconds
+from rosasync.testing._arrivals import Arrivals
 from rosasync.testing._faults import Faults, FaultyService, OpenService, StubCall, set_in_block
-from rosasync.testing._matching import check_fields, count, describe, explain_mismatch
-from rosasync.testing._rules import Match, Rule, take_answer
+from rosasync.testing._matching import count, describe, explain_mismatch
+from rosasync.testing._rules import Match, Rules
 from rosasync.typing import FeedbackT, GoalT, ResultT
 
 if TYPE_CHECKING:
@@ -31,8 +31,6 @@ GoalAnswer: TypeAlias = Any
 """The result of a goal, a message or a mapping of its fields; `GoalRejected` to reject it; an
 exception that the handler raises, such as ``GoalAborted("blocked", result={…})``; or None to run
 until it is cancelled."""
-
-logger = logging.getLogger("rosasync")
 
 STUB = object()
 """The handler of an action server whose answers are given by `StubActionServer.answer`."""
@@ -116,15 +114,14 @@ class StubActionServer(Generic[GoalT, ResultT, FeedbackT]):
             self._options = {"concurrency": 100, "on_goal": self._is_accepted, **options}
         self._on_cancel = self._options.pop("on_cancel", None)
         self._open_server = open_server
-        self._on_unexpected = on_unexpected
-        self._rules: list[Rule[_Plan]] = []
+        self._rules = Rules[_Plan](self._type.Goal, on_unexpected)
         # What `_is_accepted` has decided on the goal that is accepted next, and on those that run.
         self._decided: _Plan | None = None
         self._plans: dict[UUID, _Plan] = {}
         self._refusing = False
         self._faults = Faults()
         self._result_faults = Faults()
-        self._changed = asyncio.Event()
+        self._arrivals = Arrivals()
         self._server = self._open()
 
     def __repr__(self) -> str:
@@ -183,14 +180,11 @@ class StubActionServer(Generic[GoalT, ResultT, FeedbackT]):
         Raises:
             TypeError, ValueError: an answer or a field does not fit the action type.
         """
-        if not answers:
-            raise ValueError(f"{self.action_name}: answer() takes at least one answer")
-        if isinstance(match, Mapping):
-            check_fields(self._type.Goal, match)
+        self._rules.check(self.action_name, match, answers)
         messages = tuple(make_message(self._type.Feedback, message) for message in feedback)
         seconds = check_seconds("delay", delay)
         plans = [_Plan(self._prepare(answer), messages, seconds) for answer in answers]
-        self._rules.append(Rule.of(match, plans))
+        self._rules.add(match, plans)
         return self
 
     def refuse_cancellations(self) -> AbstractContextManager[None]:
@@ -238,13 +232,8 @@ class StubActionServer(Generic[GoalT, ResultT, FeedbackT]):
         Raises:
             AssertionError: it has not, after ``timeout`` seconds.
         """
-        try:
-            async with asyncio.timeout(timeout):
-                while len(self.goals) < number:
-                    self._changed.clear()
-                    await self._changed.wait()
-        except TimeoutError:
-            raise self._failure(f"expected {count(number, 'goal')} within {timeout:g} s") from None
+        if not await self._arrivals.wait_for(number, self.goals, timeout):
+            raise self._failure(f"expected {count(number, 'goal')} within {timeout:g} s")
         return self.goals[:number]
 
     def assert_goals(self, *expected: Mapping[str, Any]) -> None:
@@ -255,9 +244,8 @@ class StubActionServer(Generic[GoalT, ResultT, FeedbackT]):
             ValueError: the goal has no such field.
         """
         __tracebackhide__ = True
-        for fields in expected:
-            check_fields(self._type.Goal, fields)
-        if (differences := explain_mismatch(expected, self.requests)) is not None:
+        differences = explain_mismatch(self._type.Goal, expected, self.requests)
+        if differences is not None:
             raise self._failure(f"expected {count(len(expected), 'goal')}", f"\n{differences}")
 
     def assert_statuses(self, *expected: GoalStatus) -> None:
@@ -303,7 +291,7 @@ class StubActionServer(Generic[GoalT, ResultT, FeedbackT]):
 
     def _on_goal_request(self, call: StubCall[Any, Any]) -> None:
         self.goals.append(StubGoal(call.request.goal, UUID(bytes=bytes(call.request.goal_id.uuid))))
-        self._changed.set()
+        self._arrivals.notify()
 
     def _accept(self, accepted: ServerGoal[Any, Any]) -> None:
         next(goal for goal in reversed(self.goals) if goal.id == accepted.id).accepted = accepted
@@ -311,13 +299,8 @@ class StubActionServer(Generic[GoalT, ResultT, FeedbackT]):
             self._plans[accepted.id] = self._decided
 
     def _is_accepted(self, request: Any) -> bool:
-        self._decided = take_answer(self._rules, request)
-        if self._decided is None:
-            problem = f"{self.action_name} has no answer left for {to_dict(request)}"
-            logger.warning("%s", problem)
-            self._on_unexpected(problem)
-            return False
-        return not self._decided.rejects
+        self._decided = self._rules.take(self.action_name, request)
+        return self._decided is not None and not self._decided.rejects
 
     async def _run(self, goal: ServerGoal[Any, Any]) -> Any:
         return await self._plans.pop(goal.id).run(goal)
