@@ -16,7 +16,7 @@ from __future__ import annotations
 import contextlib
 import logging
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, Generic
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from rosasync._actions.proxy import ActionState, AsyncActionProxy
 from rosasync._core.proxy import AsyncServiceProxy, ProxyState
@@ -52,10 +52,51 @@ __all__ = ["CallService", "FromBlackboard", "FromConstant", "SendGoal", "WaitFor
 logger = logging.getLogger("rosasync")
 
 
-class Leaf(Behaviour):  # type: ignore[misc]
-    """What the behaviours share: the blackboard variables that a user names, if any."""
+ProxyT = TypeVar("ProxyT", bound="AsyncServiceProxy[Any, Any] | AsyncActionProxy[Any, Any, Any]")
+
+
+class Leaf(Behaviour, Generic[ProxyT]):  # type: ignore[misc]
+    """What the behaviours share: a proxy from `setup` to `shutdown`, and the blackboard."""
 
     blackboard: Any
+
+    def __init__(self, name: str, session: Session | None) -> None:
+        super().__init__(name)
+        self._session = session
+        self._proxy: ProxyT | None = None
+        self._key_error: str | None = None
+        self._on_error: Callable[[Exception], Status | None] | None = None
+
+    def terminate(self, new_status: Status) -> None:
+        """Cancel the call, the wait or the goal if the behaviour is interrupted."""
+        if new_status is Status.INVALID and self._proxy is not None:
+            self._stop(self._proxy)
+
+    def shutdown(self) -> None:
+        """Do what an interruption does, and drop the proxy. `setup` may be called again."""
+        if self._proxy is not None:
+            self._proxy.shutdown()
+            self._proxy = None
+
+    def _stop(self, proxy: ProxyT) -> None:
+        """Cancel what the proxy does."""
+        raise NotImplementedError
+
+    def _find_session(self, given: Mapping[str, Any]) -> Session:
+        session: Session | None = self._session or given.get("session")
+        if session is None:
+            raise KeyError(
+                f"{self.qualified_name} has no session: call tree.setup(session=session), or give "
+                "it session="
+            )
+        return session
+
+    def _require_proxy(self) -> ProxyT:
+        if self._proxy is None:
+            raise UsageError(
+                f"{self.qualified_name} is not set up: call tree.setup(session=session)"
+            )
+        return self._proxy
 
     def _register(self, access: Access, *names: str | None) -> None:
         for name in names:
@@ -76,9 +117,39 @@ class Leaf(Behaviour):  # type: ignore[misc]
         with contextlib.suppress(KeyError):
             self.blackboard.set(name, None)
 
+    def _take(self, given: Any, key: str | None) -> Any:
+        """Return the input of a run: from the blackboard, from a function, or a constant."""
+        if key is not None:
+            return self.blackboard.get(key)
+        return given() if callable(given) else given
 
-class ServiceBehaviour(Leaf, Generic[RequestT, ResponseT]):
-    """The base of both behaviours: holds a proxy from `setup` to `shutdown`."""
+    def _failed(self, error: Exception | None, aborted: str) -> Status:
+        """Report the error of the run, None if it was aborted; return the status to end with."""
+        status = None
+        try:
+            if error is not None:
+                self._set(self._key_error, error)
+            self._set_feedback(aborted if error is None else str(error))
+            if self._on_error is not None and error is not None:
+                status = self._on_error(error)
+        except Exception as later:
+            later.__context__ = later.__context__ or error
+            self._log("the error was not handled", later)
+            self.feedback_message = str(later)
+            with contextlib.suppress(Exception):
+                self._set(self._key_error, later)
+        return Status.FAILURE if status is None else status
+
+    def _set_feedback(self, message: str) -> None:
+        self.feedback_message = message
+
+    def _log(self, what: str, error: Exception, *, traceback: bool = True) -> None:
+        shown = error if traceback else None
+        logger.error("%s: %s: %r", self.qualified_name, what, error, exc_info=shown)
+
+
+class ServiceBehaviour(Leaf[AsyncServiceProxy[RequestT, ResponseT]], Generic[RequestT, ResponseT]):
+    """The base of the behaviours that have a service."""
 
     def __init__(
         self,
@@ -89,13 +160,11 @@ class ServiceBehaviour(Leaf, Generic[RequestT, ResponseT]):
         session: Session | None,
         retry: Retry | None = None,
     ) -> None:
-        super().__init__(name)
+        super().__init__(name, session)
         self.srv_type = srv_type
         self.srv_name = srv_name
         self._qos = qos
         self._retry = retry
-        self._session = session
-        self._proxy: AsyncServiceProxy[RequestT, ResponseT] | None = None
 
     def setup(self, **kwargs: Any) -> None:
         """Take the session from the constructor or from ``tree.setup(session=…)``; never blocks.
@@ -107,27 +176,11 @@ class ServiceBehaviour(Leaf, Generic[RequestT, ResponseT]):
             InvalidServiceName: ROS does not allow the name.
             SessionClosed: the session is closed.
         """
-        session = self._session or kwargs.get("session")
-        if session is None:
-            raise KeyError(
-                f"{self.qualified_name} has no session: call tree.setup(session=session), or give "
-                "it session="
-            )
+        session = self._find_session(kwargs)
         self.shutdown()
         self._proxy = AsyncServiceProxy(
             session, self.srv_type, self.srv_name, qos=self._qos, retry=self._retry
         )
-
-    def terminate(self, new_status: Status) -> None:
-        """Cancel the operation if the behaviour is interrupted."""
-        if new_status is Status.INVALID and self._proxy is not None:
-            self._proxy.stop_call()
-
-    def shutdown(self) -> None:
-        """Cancel the operation and drop the proxy. `setup` may be called again afterwards."""
-        if self._proxy is not None:
-            self._proxy.shutdown()
-            self._proxy = None
 
     @property
     def proxy(self) -> AsyncServiceProxy[RequestT, ResponseT]:
@@ -136,11 +189,10 @@ class ServiceBehaviour(Leaf, Generic[RequestT, ResponseT]):
         Raises:
             UsageError: the behaviour is not set up.
         """
-        if self._proxy is None:
-            raise UsageError(
-                f"{self.qualified_name} is not set up: call tree.setup(session=session)"
-            )
-        return self._proxy
+        return self._require_proxy()
+
+    def _stop(self, proxy: AsyncServiceProxy[RequestT, ResponseT]) -> None:
+        proxy.stop_call()
 
 
 class CallService(ServiceBehaviour[RequestT, ResponseT]):
@@ -247,7 +299,8 @@ class CallService(ServiceBehaviour[RequestT, ResponseT]):
         try:
             self._unset(self._key_response)
             self._unset(self._key_error)
-            proxy.call_service(self._take_request(), self._timeout, wait=self._wait)
+            request = self._take(self._request, self._key_request)
+            proxy.call_service(request, self._timeout, wait=self._wait)
             self._set_feedback(f"calling {self.srv_name}")
         except Exception as error:
             # The call may be out, if its feedback has failed.
@@ -259,8 +312,9 @@ class CallService(ServiceBehaviour[RequestT, ResponseT]):
     def update(self) -> Status:
         """Return the status of the call."""
         proxy = self.proxy
+        aborted = f"{self.srv_name}: aborted"
         if self._start_error is not None:
-            return self._failed(self._start_error)
+            return self._failed(self._start_error, aborted)
         state = proxy.get_state()
         if state is ProxyState.RUNNING:
             return Status.RUNNING
@@ -269,14 +323,9 @@ class CallService(ServiceBehaviour[RequestT, ResponseT]):
                 return self._answered(proxy.get_response())
             except Exception as error:
                 self._log("the response was not handled", error)
-                return self._failed(error)
+                return self._failed(error, aborted)
         errors = proxy.get_errors()
-        return self._failed(errors[0] if errors else None)
-
-    def _take_request(self) -> Any:
-        if self._key_request is not None:
-            return self.blackboard.get(self._key_request)
-        return self._request() if callable(self._request) else self._request
+        return self._failed(errors[0] if errors else None, aborted)
 
     def _answered(self, response: ResponseT | None) -> Status:
         # Only a bool: a number 0 often means that there was no error.
@@ -291,29 +340,8 @@ class CallService(ServiceBehaviour[RequestT, ResponseT]):
             return Status.FAILURE if unsuccessful else Status.SUCCESS
         return status
 
-    def _failed(self, error: Exception | None) -> Status:
-        """Report the error of the run, None if it was aborted; return the status to end with."""
-        status = None
-        try:
-            if error is not None:
-                self._set(self._key_error, error)
-            self._set_feedback(f"{self.srv_name}: aborted" if error is None else str(error))
-            if self._on_error is not None and error is not None:
-                status = self._on_error(error)
-        except Exception as later:
-            later.__context__ = later.__context__ or error
-            self._log("the error was not handled", later)
-            self.feedback_message = str(later)
-            with contextlib.suppress(Exception):
-                self._set(self._key_error, later)
-        return Status.FAILURE if status is None else status
-
-    def _log(self, what: str, error: Exception, *, traceback: bool = True) -> None:
-        shown = error if traceback else None
-        logger.error("%s: %s: %r", self.qualified_name, what, error, exc_info=shown)
-
     def _set_feedback(self, message: str) -> None:
-        self.feedback_message = message
+        super()._set_feedback(message)
         self._set(self._key_feedback_message, message)
         if self._on_feedback is not None:
             self._on_feedback(message)
@@ -421,7 +449,9 @@ class WaitForService(ServiceBehaviour[Any, Any]):
         return Status.FAILURE
 
 
-class SendGoal(Leaf, Generic[GoalT, ResultT, FeedbackT]):
+class SendGoal(
+    Leaf[AsyncActionProxy[GoalT, ResultT, FeedbackT]], Generic[GoalT, ResultT, FeedbackT]
+):
     """Sends a goal to an action once in each run. It is RUNNING until the goal has ended.
 
     It ends with SUCCESS if the goal has succeeded, and with FAILURE otherwise. An interruption
@@ -477,7 +507,7 @@ class SendGoal(Leaf, Generic[GoalT, ResultT, FeedbackT]):
         wait: bool | float = True,
         session: Session | None = None,
     ) -> None:
-        super().__init__(name)
+        super().__init__(name, session)
         if goal is not None and key_goal is not None:
             raise TypeError("give either a goal or a key_goal, not both")
         check_timeout(timeout, None)
@@ -488,10 +518,8 @@ class SendGoal(Leaf, Generic[GoalT, ResultT, FeedbackT]):
         self._timeout = timeout
         self._accept_timeout = accept_timeout
         self._wait = wait
-        self._session = session
-        self._proxy: AsyncActionProxy[GoalT, ResultT, FeedbackT] | None = None
-        # Why the run has failed, if not by its goal.
-        self._own_error: Exception | None = None
+        # Why the run has failed, if its goal could not be sent.
+        self._start_error: Exception | None = None
         self._shown: FeedbackT | None = None
         self._on_result = on_result
         self._on_feedback = on_feedback
@@ -511,11 +539,7 @@ class SendGoal(Leaf, Generic[GoalT, ResultT, FeedbackT]):
         Raises:
             UsageError: the behaviour is not set up.
         """
-        if self._proxy is None:
-            raise UsageError(
-                f"{self.qualified_name} is not set up: call tree.setup(session=session)"
-            )
-        return self._proxy
+        return self._require_proxy()
 
     def setup(self, **kwargs: Any) -> None:
         """Take the session, and check a constant goal; never blocks.
@@ -526,12 +550,7 @@ class SendGoal(Leaf, Generic[GoalT, ResultT, FeedbackT]):
             InvalidServiceName: ROS does not allow the name.
             SessionClosed: the session is closed.
         """
-        session = self._session or kwargs.get("session")
-        if session is None:
-            raise KeyError(
-                f"{self.qualified_name} has no session: call tree.setup(session=session), or give "
-                "it session="
-            )
+        session = self._find_session(kwargs)
         self.shutdown()
         self._proxy = AsyncActionProxy(session, self.action_type, self.action_name)
         if not callable(self._goal) and self._key_goal is None:
@@ -541,56 +560,45 @@ class SendGoal(Leaf, Generic[GoalT, ResultT, FeedbackT]):
         """Send the goal."""
         proxy = self.proxy
         proxy.cancel_goal()
-        self._own_error = self._shown = None
+        self._start_error = self._shown = None
         try:
             for key in (self._key_result, self._key_feedback, self._key_error):
                 self._unset(key)
             proxy.send_goal(
-                self._take_goal(),
+                self._take(self._goal, self._key_goal),
                 self._timeout,
                 accept_timeout=self._accept_timeout,
                 wait=self._wait,
             )
-            self.feedback_message = f"sending a goal to {self.action_name}"
+            self._set_feedback(f"sending a goal to {self.action_name}")
         except Exception as error:
-            self._own_error = error
-            logger.error("%s: the goal was not sent: %r", self.qualified_name, error)
+            self._start_error = error
+            # As in `CallService`: a missing variable is usual.
+            self._log("the goal was not sent", error, traceback=self._key_goal is None)
 
     def update(self) -> Status:
         """Return the status of the goal."""
-        if self._own_error is not None:
-            return self._failed(self._own_error)
+        aborted = f"{self.action_name}: cancelled"
+        if self._start_error is not None:
+            return self._failed(self._start_error, aborted)
         proxy = self.proxy
         state = proxy.get_state()
         try:
             self._show_feedback(proxy.get_feedback())
             if state in _GOAL_OUT:
-                self.feedback_message = f"{self.action_name}: {state.name.lower()}"
+                self._set_feedback(f"{self.action_name}: {state.name.lower()}")
                 return Status.RUNNING
             if state is ActionState.SUCCEEDED:
                 return self._succeeded(proxy.get_result())
         except Exception as error:
             proxy.cancel_goal()
-            logger.exception("%s: the goal was not handled", self.qualified_name)
-            return self._failed(error)
+            self._log("the goal was not handled", error)
+            return self._failed(error, aborted)
         errors = proxy.get_errors()
-        return self._failed(errors[0] if errors else None)
+        return self._failed(errors[0] if errors else None, aborted)
 
-    def terminate(self, new_status: Status) -> None:
-        """Cancel the goal if the behaviour is interrupted."""
-        if new_status is Status.INVALID and self._proxy is not None:
-            self._proxy.cancel_goal()
-
-    def shutdown(self) -> None:
-        """Cancel the goal and drop the proxy. `setup` may be called again afterwards."""
-        if self._proxy is not None:
-            self._proxy.shutdown()
-            self._proxy = None
-
-    def _take_goal(self) -> Any:
-        if self._key_goal is not None:
-            return self.blackboard.get(self._key_goal)
-        return self._goal() if callable(self._goal) else self._goal
+    def _stop(self, proxy: AsyncActionProxy[GoalT, ResultT, FeedbackT]) -> None:
+        proxy.cancel_goal()
 
     def _show_feedback(self, feedback: FeedbackT | None) -> None:
         if feedback is not None and feedback is not self._shown:
@@ -600,25 +608,12 @@ class SendGoal(Leaf, Generic[GoalT, ResultT, FeedbackT]):
                 self._on_feedback(feedback)
 
     def _succeeded(self, result: ResultT | None) -> Status:
-        self.feedback_message = f"{self.action_name} succeeded"
+        self._set_feedback(f"{self.action_name} succeeded")
         self._set(self._key_result, result)
         status = None
         if self._on_result is not None and result is not None:
             status = self._on_result(result)
         return Status.SUCCESS if status is None else status
-
-    def _failed(self, error: Exception | None) -> Status:
-        """Report the error of the run, None if it was cancelled; return the status to end with."""
-        self.feedback_message = f"{self.action_name}: cancelled" if error is None else str(error)
-        status = None
-        try:
-            if error is not None:
-                self._set(self._key_error, error)
-                if self._on_error is not None:
-                    status = self._on_error(error)
-        except Exception:
-            logger.exception("%s: the error was not handled", self.qualified_name)
-        return Status.FAILURE if status is None else status
 
 
 _GOAL_OUT = (ActionState.WAITING, ActionState.ACTIVE, ActionState.CANCELING)

@@ -300,6 +300,27 @@ async def test_a_function_of_a_leaf_that_raises_cancels_the_goal(
     tree.shutdown()
 
 
+async def test_an_error_of_on_error_is_the_error_of_the_run(
+    session: Session, server: Server, caplog: pytest.LogCaptureFixture
+) -> None:
+    server.error = GoalAborted("blocked")
+    server.go_on.set()
+
+    def fails(error: Exception) -> Status:
+        raise ZeroDivisionError("in on_error")
+
+    leaf = SendGoal("count", Fibonacci, "/fibonacci", on_error=fails, key_error="error")
+    tree = BehaviourTree(leaf)
+    tree.setup(session=session)
+    assert await run(tree) is Status.FAILURE
+    error = Blackboard.get("error")
+    assert isinstance(error, ZeroDivisionError)
+    assert isinstance(error.__context__, GoalAborted)
+    assert leaf.feedback_message == "in on_error"
+    assert "the error was not handled" in caplog.text
+    tree.shutdown()
+
+
 async def test_a_leaf_takes_its_goal_from_the_blackboard(session: Session, server: Server) -> None:
     with pytest.raises(TypeError, match="either a goal or a key_goal"):
         SendGoal("count", Fibonacci, "/fibonacci", {"order": 1}, key_goal="goal")
