@@ -30,6 +30,8 @@ __all__ = ["Dispatch", "LeaseWaiter", "Waiter"]
 OVERLOAD = 1.0
 """Minimum number of seconds for which a service counts as overloaded, after a caller was passed
 over. Callers whose deadlines pass together come back together, and would fill the window again."""
+PERSISTENCE = 4
+"""The same as a number of response times, for a slow server."""
 
 
 class Waiter(Protocol):
@@ -301,7 +303,7 @@ class Dispatch:
             if waiter.deadline is None or waiter.deadline - now >= needed:
                 return waiter
             waiter.passed = (needed, waiter.deadline - now)
-            self.overloaded_until = now + max(OVERLOAD, needed)
+            self.overloaded_until = now + max(OVERLOAD, PERSISTENCE * needed)
             self._latest = max(self._latest, waiter.deadline) if self.passed else waiter.deadline
             self.passed[waiter] = None
         if not self.passed or not client.window.idle:

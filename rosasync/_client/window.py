@@ -14,14 +14,15 @@ if TYPE_CHECKING:
 
 __all__ = ["Window"]
 
-RECENT = 40
-"""The number of response times from which the next one is estimated."""
+RECENT = 100
+"""The number of response times from which the next one is estimated. Those of a full window
+overlap, so a hundred of them hold about ten that are independent of each other."""
 FEW = 3
 """Fewer response times than these say nothing."""
 STALE = 10.0
 """Seconds after which a response time says nothing any more, beyond its own length."""
-WORK_WEIGHT = 1 / 8
-"""Weight of the time for which the server has worked on the last request alone."""
+DEVIATIONS = 2.0
+"""So many standard deviations above the mean, one response time in forty is longer."""
 TIMED = 16
 """The first requests are timed, and then one of this many."""
 
@@ -74,7 +75,6 @@ class Window:
         "_outdated",
         "_outdated_since",
         "_recent",
-        "_work",
         "abandoned",
         "answered",
         "last",
@@ -98,12 +98,10 @@ class Window:
         self.servers: Servers = frozenset()
         self.times = ResponseTimes()
         self._grace = grace
-        # The last response times: when each was measured, how long it was, and how many places were
-        # taken when its request was sent.
-        self._recent: deque[tuple[float, float, int]] = deque(maxlen=RECENT)
-        # For how long the server works on one request, on average: from its send or the answer
-        # before, whichever is later, to its answer.
-        self._work = 0.0
+        # The last response times: when each was measured, how long it was, how many places were
+        # taken when its request was sent, and for how long the server worked on it: from its send
+        # or the answer before, whichever is later, to its answer.
+        self._recent: deque[tuple[float, float, int, float]] = deque(maxlen=RECENT)
         self._last_answer = 0.0
         # The requests without a caller, each with the time until which it is remembered. Requests
         # that have been answered in the meantime are dropped when they come to the front.
@@ -219,9 +217,8 @@ class Window:
         self.silent_since = now
         seconds = now - sent.at
         work = now - max(sent.at, self._last_answer)
-        self._work += (work - self._work) * (WORK_WEIGHT if self._recent else 1.0)
         self._last_answer = now
-        self._recent.append((now, seconds, sent.out))
+        self._recent.append((now, seconds, sent.out, work))
         if number <= TIMED or not number % TIMED:
             self.times.add(seconds)
         if number in self._outdated:
@@ -271,22 +268,32 @@ class Window:
     def expected(self, now: float) -> float:
         """Return the seconds until a request that is sent now is answered, at most; 0 if unknown.
 
-        This is the second longest of the recent response times, so that one in twenty takes longer.
-        Each is reduced to the places that are taken now: if a server works on one request after
-        another, the time grows with the number of requests ahead. For the same reason, it is at
-        least the time that the server works on one, for each that is out: so it is known how long
-        a full window takes before the first request that has met one is answered.
+        If the server works on one request after another, it works on each that is out for the mean
+        of the recent times. Its answers deviate from that: what counts is by how much, for each
+        request that was out. The deviations of several requests add up as their squares, and the
+        mean is not known exactly either. That gives the interval in which the next response time
+        lies. A quantile of the response times would be too low: those of a full window share the
+        same work, so a few of them say little of what is rare.
+
+        If it works on several at once, that is too much. So it is not more than the longest recent
+        response time, reduced to the places that are taken now.
         """
-        out = self.taken + 1
-        times = sorted(
-            seconds * min(1.0, out / then)
-            for measured, seconds, then in self._recent
+        recent = [
+            (seconds, then, work)
+            for measured, seconds, then, work in self._recent
             if now - measured <= STALE + seconds
-        )
-        if len(times) < FEW:
+        ]
+        count = len(recent)
+        if count < FEW:
             return 0.0
+        out = self.taken + 1
+        mean = sum(work for _, _, work in recent) / count
+        # The variance that each request adds.
+        variance = sum((seconds - then * mean) ** 2 / then for seconds, then, _ in recent) / count
+        interval = out * mean + DEVIATIONS * math.sqrt(variance * out * (1 + out / count))
+        longest = max(seconds * min(1.0, out / then) for seconds, then, _ in recent)
         # And one more, for what the server may get from others in the meantime.
-        return max(times[-2], out * self._work) + self._work
+        return min(interval, max(longest, out * mean)) + mean
 
     def due(self, callers_wait: bool, resend: Sent | None) -> float:
         """Return the time at which `on_time` has something to do; infinite if it never has.

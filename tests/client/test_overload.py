@@ -1,0 +1,107 @@
+"""Overloads in virtual time: what is answered, and what `Retry` adds to it."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import pytest
+
+from rosasync import Retry
+from rosasync._client.retry import PER_SECOND
+from tests.support.fake_graph import FakeGraph
+from tests.support.overload import Case, Outcome, StockCaller, VirtualLoop, offer, simulate
+from tests.support.plain import Echo, echo
+
+HASTY = Retry(attempts=10, after=0.05, backoff=1.0, budget=0.2)
+
+
+def play(scenario: Callable[[FakeGraph], Awaitable[None]]) -> None:
+    """Run a scenario on a loop in virtual time."""
+    loop = VirtualLoop()
+    try:
+        loop.run_until_complete(_run(scenario))
+    finally:
+        loop.close()
+
+
+async def _run(scenario: Callable[[FakeGraph], Awaitable[None]]) -> None:
+    await scenario(FakeGraph())
+
+
+@pytest.mark.parametrize(
+    ("case", "goodput", "late"),
+    [
+        # The timeout is ten times the work.
+        (Case(work=0.01, timeouts=(0.1,), load=1.5), 0.97, 0.02),
+        (Case(work=0.01, timeouts=(0.1,), load=1.5, exponential=True), 0.92, 0.06),
+        (Case(work=0.01, timeouts=(0.1,), load=4, exponential=True), 0.9, 0.08),
+        # Five times the work, so that a full window would take longer than the callers have.
+        (Case(work=0.1, timeouts=(0.5,), load=1.5), 0.93, 0.05),
+        # Fifty times the work, with response times that overlap.
+        (Case(work=0.01, timeouts=(0.5,), load=4, exponential=True), 0.95, 0.05),
+    ],
+)
+def test_the_server_works_for_callers_that_still_wait(
+    case: Case, goodput: float, late: float
+) -> None:
+    result = simulate(case)
+    assert result.goodput >= goodput
+    assert result.late <= late
+    assert result.lost == 0
+
+
+@pytest.mark.parametrize("failing", ["requests", "responses"])
+def test_retries_keep_to_their_budget_whatever_fails(failing: str) -> None:
+    async def scenario(graph: FakeGraph) -> None:
+        graph.serve(Echo, "/echo", echo)
+        async with graph.session() as session:
+            await session.wait_for_service(Echo, "/echo")
+            lossy = graph.drop_requests() if failing == "requests" else graph.drop_responses()
+            with lossy:
+                outcome = await offer(session, 100, 5.0, timeout=0.5, retry=HASTY)
+            retried = session.pool.statistics().retried
+            assert outcome.answered == 0
+            # The tokens of the first second, those of the time, and the share of the calls.
+            assert 0 < retried <= PER_SECOND * (1.0 + 5.5) + HASTY.budget * 500
+
+    play(scenario)
+
+
+@pytest.mark.parametrize("retry", [None, HASTY])
+def test_retries_to_a_server_that_serves_the_newest_first_keep_to_their_budget(
+    retry: Retry | None,
+) -> None:
+    """Answers to later requests show no loss there, so the fast retry errs."""
+    runs: dict[int, int] = {}
+
+    async def scenario(graph: FakeGraph) -> None:
+        async def handler(request: Any, response: Any) -> Any:
+            await asyncio.sleep(0.01)
+            if request.value >= 0:
+                runs[request.value] = runs.get(request.value, 0) + 1
+            return Echo.Response(request.value)
+
+        async with graph.session() as serving, graph.session() as session:
+            server = serving.serve(Echo, "/echo", handler, concurrency=1)
+            await session.wait_for_service(Echo, "/echo")
+            flood = StockCaller(graph, Outcome(), value=-1)
+            numbers, calls = itertools.count(), []
+            for number in range(1000):
+                await flood.call(1.0)
+                if number % 5 == 0:
+                    request = Echo.Request(next(numbers))
+                    calls.append(session.start(Echo, "/echo", request, timeout=1.0, retry=retry))
+                await asyncio.sleep(0.005)
+            assert server.statistics().overloads
+            await asyncio.wait(calls)
+            answered = sum(call.exception() is None for call in calls)
+            twice = sum(count - 1 for count in runs.values())
+            assert answered >= 0.9 * len(calls)
+            assert twice <= session.pool.statistics().retried <= PER_SECOND * 7 + 0.2 * 200
+            if retry is None:
+                assert twice == 0
+
+    play(scenario)
