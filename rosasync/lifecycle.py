@@ -10,14 +10,16 @@
 
 from __future__ import annotations
 
+import asyncio
 import enum
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
-from rosasync import CallError, ResponseTimeout, RosasyncError
+from rosasync import CallError, ResponseTimeout, Retry, RosasyncError
 from rosasync._core.node_client import NodeClient
 from rosasync._core.text import duration
+from rosasync.options import check_retry
 
 if TYPE_CHECKING:
     from rosasync import Session
@@ -33,6 +35,9 @@ __all__ = [
 ]
 
 Outcome: TypeAlias = Literal["not done", "unknown"]
+
+POLL = 0.1
+"""Seconds between two looks at the state of a node that is in a transition."""
 
 
 class LifecycleState(enum.StrEnum):
@@ -131,8 +136,7 @@ class TransitionTimeout(TransitionError, TimeoutError):
 
         Even a transition that is not done may be made later, when the node gets to it.
         """
-        state = self.state or LifecycleState.UNKNOWN
-        return "unknown" if state is LifecycleState.UNKNOWN or state.in_transition else "not done"
+        return "unknown" if self.state is None or _is_undecided(self.state) else "not done"
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,21 +178,43 @@ class LifecycleClient(NodeClient):
     that the transition leads to, the method returns as usual. Otherwise it raises
     `TransitionTimeout`, whose ``outcome`` is ``"not done"`` or ``"unknown"``.
 
+    A transition is sent once, unless there is a ``retry``. Then an unanswered one is sent again,
+    but only after the node has said that it is in the state in which the transition starts. While
+    the node is in a transition, the client waits for its end, within the timeout. So no transition
+    is made twice. One whose callback failed leaves the state as it was: if its response was lost,
+    it is sent again, and the callback runs again.
+
     Args:
         session: an open session.
         node_name: the node's name, ``"/camera"``. Relative names are resolved as service names are.
         timeout: seconds for each call, None for no deadline; if left out, the session's. Each
             method takes a ``timeout`` of its own, and the client's is used if that is left out.
+        retry: when to send an unanswered request again; None for never. It has no ``verify``,
+            because the client asks the node itself.
 
     Raises:
         InvalidServiceName: ROS does not allow the name.
-        TypeError, ValueError: the timeout does not fit.
+        TypeError, ValueError: the timeout or the retry does not fit.
         UsageError: the session is not open, or belongs to another loop or thread.
         SessionClosed, ContextShutdown: the session has ended.
     """
 
-    def __init__(self, session: Session, node_name: str, *, timeout: Timeout = ...) -> None:
+    def __init__(
+        self,
+        session: Session,
+        node_name: str,
+        *,
+        timeout: Timeout = ...,
+        retry: Retry | None = None,
+    ) -> None:
+        check_retry(retry)
+        if retry is not None and retry.verify is not None:
+            raise ValueError(
+                "retry: a LifecycleClient asks the node for its state before it sends a transition "
+                "again: leave out verify"
+            )
         super().__init__(session, node_name, timeout, "lifecycle_msgs/srv/GetState", "get_state")
+        self._retry = retry
 
     async def state(self, *, timeout: Timeout = ...) -> LifecycleState:
         """Return the node's state.
@@ -196,7 +222,7 @@ class LifecycleClient(NodeClient):
         Args:
             timeout: seconds, None for no deadline; if left out, the client's.
         """
-        response = await self._call("GetState", "get_state", {}, timeout)
+        response = await self._call("GetState", "get_state", {}, timeout, self._retry)
         return _state(response.current_state)
 
     async def transitions(self, *, timeout: Timeout = ...) -> list[LifecycleTransition]:
@@ -206,7 +232,7 @@ class LifecycleClient(NodeClient):
             timeout: seconds, None for no deadline; if left out, the client's.
         """
         response = await self._call(
-            "GetAvailableTransitions", "get_available_transitions", {}, timeout
+            "GetAvailableTransitions", "get_available_transitions", {}, timeout, self._retry
         )
         return [
             LifecycleTransition(
@@ -257,13 +283,28 @@ class LifecycleClient(NodeClient):
         # A stock node whose state does not allow the transition raises an exception, and ends, if
         # it is asked by the number alone. micro-ROS reads the number only.
         request = {"transition": {"id": number, "label": label}}
+        retry = self._retry
+        if retry is not None:
+            retry = replace(retry, verify=partial(self._find_out, label, number))
         try:
-            response = await self._call("ChangeState", "change_state", request, timeout)
+            response = await self._call("ChangeState", "change_state", request, timeout, retry)
         except ResponseTimeout as error:
             return await self._settle(label, error, timeout)
         if response.success:
             return kind.goal
         raise self._failed(label, await self._state_if_known(timeout))
+
+    async def _find_out(self, label: str, number: int) -> dict[str, Any] | None:
+        """Return the response to a transition by the node's state; None if it was not made.
+
+        The end of the call that may be sent again cancels this.
+        """
+        state = await self.state(timeout=None)
+        while _is_undecided(state):
+            await asyncio.sleep(POLL)
+            state = await self.state(timeout=None)
+        kind = TRANSITIONS[label]
+        return None if kind.ids.get(state) == number else {"success": state is kind.goal}
 
     async def _settle(self, label: str, error: ResponseTimeout, timeout: Timeout) -> LifecycleState:
         """Return the goal if the node is there now; otherwise raise what is known."""
@@ -309,9 +350,19 @@ class LifecycleClient(NodeClient):
             return None
 
     async def _call(
-        self, service: str, name: str, request: dict[str, Any], timeout: Timeout
+        self,
+        service: str,
+        name: str,
+        request: dict[str, Any],
+        timeout: Timeout,
+        retry: Retry | None,
     ) -> Any:
-        return await self._call_node(f"lifecycle_msgs/srv/{service}", name, request, timeout)
+        return await self._call_node(f"lifecycle_msgs/srv/{service}", name, request, timeout, retry)
+
+
+def _is_undecided(state: LifecycleState) -> bool:
+    """Return whether a state does not show if a transition is made."""
+    return state is LifecycleState.UNKNOWN or state.in_transition
 
 
 def _state(message: Any) -> LifecycleState:

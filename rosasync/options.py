@@ -194,8 +194,9 @@ class Retry:
         budget: how many requests of the service may be sent again for each call, 0.2 for one in
             five. Ten a second may be sent again besides. ``math.inf`` is no limit.
         verify: ``async def verify()``, for services that may not run twice: called before the
-            request is sent again, to find out whether it has run. A response is the call's answer;
-            None sends it again; an exception is the call's error. It runs within the call's time.
+            request is sent again, to find out whether it has run. A response, or a mapping of its
+            fields, is the call's answer; None sends it again; an exception is the call's error. It
+            runs within the call's time.
 
     Raises:
         TypeError: a value is not a number, or ``verify`` is not callable.

@@ -101,6 +101,18 @@ def test_serve_reports_what_a_handler_raises(tmp_path: Path) -> None:
     assert done.stderr.count("\n") == 1
 
 
+def test_serve_reports_that_it_closes() -> None:
+    options = ("--status", "--delay", "1000")
+    with terminal("serve", "/stub/closing", LAMP_TYPE, *options) as server:
+        server.wait_for("Ctrl-C ends it")
+        with terminal("call", "/stub/closing", LAMP_TYPE, "--timeout", "60") as call:
+            server.wait_for("data: false")
+            server.interrupt()
+            assert server.end() == 130
+            assert call.end() == 5
+    assert "the server closed before it answered" in " ".join(call.screen.split())
+
+
 @pytest.mark.parametrize(
     ("options", "says"),
     [

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 import rosasync
 from rosasync import Session
 from tests.support.echo import ECHO, request_of
+from tests.support.serving import echo_call
 from tests.support.times import LIMIT
 
 if TYPE_CHECKING:
@@ -78,6 +79,10 @@ BOUNDS = {
     "executor": Cost(functions=20, c_functions=17, peak=6300, left=50, cycles=0),
 }
 """The bytes include rclpy's own, the functions do not."""
+
+
+STATUS = 6
+"""How many functions more a server with ``status=True`` enters for a request; its client none."""
 
 
 async def cost_of(call: Call, calls: int = 1) -> Cost:
@@ -164,6 +169,23 @@ async def test_one_of_ten_calls_at_once(session: Session, echo: str) -> None:
     # Sometimes the loop tries to take a response that it has already taken with another one.
     bound = BOUNDS[session.bridge]
     assert await cost_of(ten, AT_ONCE) <= replace(bound, functions=bound.functions + 1)
+
+
+async def test_a_server_with_status_costs_its_callers_nothing(fake_graph: FakeGraph) -> None:
+    request = request_of("x")
+    async with fake_graph.session() as server, fake_graph.session() as session:
+        server.serve(ECHO, "/plain", echo_call)
+        server.serve(ECHO, "/told", echo_call, status=True)
+        plain, told = session.client(ECHO, "/plain"), session.client(ECHO, "/told")
+        without = await cost_of(lambda: plain.call(request))
+        cost = await cost_of(lambda: told.call(request))
+        publishers = fake_graph.topics.publishers
+        assert any(publisher.topic_name.endswith("/reports") for publisher in publishers)
+        assert not any(publisher.kept for publisher in publishers)
+    # Both sides are in this process: the server keeps the call until it is answered.
+    assert cost.functions <= without.functions + STATUS
+    assert cost.left <= without.left + 50
+    assert cost.cycles == 0
 
 
 async def test_what_is_more_is_noticed(fake_graph: FakeGraph) -> None:

@@ -13,14 +13,16 @@ from typing import Any
 
 import anyio
 import pytest
-from rcl_interfaces.srv import GetParameters
+from lifecycle_msgs.srv import ChangeState, GetState
+from rcl_interfaces.srv import GetParameters, SetParameters
 from std_srvs.srv import SetBool, Trigger
 from test_msgs.action import Fibonacci
 
 import rosasync
 from rosasync.lifecycle import LifecycleClient
 from rosasync.parameters import ParameterClient
-from rosasync.testing import Graph
+from rosasync.testing import Graph, VirtualClock
+from tests.support.fake_graph import FakeGraph
 from tests.support.servers import running
 from tests.support.times import LIMIT
 from tests.test_docs import DOCS, EXAMPLES, NAME, name_of, python_blocks
@@ -154,3 +156,70 @@ async def test_the_cells_of_a_notebook(graph: Graph) -> None:
     assert len(names["answers"]) == 2
     assert names["seen"] == [True]
     assert names["session"].closed
+
+
+class TestVerify:
+    """The page on retries: what it verifies is not done twice, although the answer was lost."""
+
+    @pytest.mark.parametrize("lost", ["request", "response"])
+    @pytest.mark.parametrize("which", ["is_open", "LifecycleClient", "is_set"])
+    async def test_it_is_done_once(self, which: str, lost: str, fake_graph: FakeGraph) -> None:
+        async with (
+            fake_graph.session() as serving,
+            fake_graph.session(timeout=LIMIT) as session,
+        ):
+            robot = LossyRobot(serving, lost)
+            names = known(session)
+            (code,) = (c for c in python_blocks(DOCS / "how-to" / "retry.md") if which in c)
+            clock = VirtualClock()
+            await clock.skip(run(code, names))
+            if which == "LifecycleClient":
+                assert await clock.skip(names["configure"](session, "/camera")) == "inactive"
+            elif which == "is_set":
+                response = await clock.skip(names["set_height"](session, 0.5))
+                assert response.results[0].successful
+            assert robot.done == 1
+            assert robot.asked == (2 if lost == "request" else 1)
+            robot.end()
+
+
+class LossyRobot:
+    """A gripper, a camera and a lift. What is asked first does not arrive, or is not answered."""
+
+    def __init__(self, session: rosasync.Session, lost: str) -> None:
+        self.asked = self.done = 0
+        self._lost = lost
+        self._kept: list[rosasync.ServiceCall[Any, Any]] = []
+        session.serve(Trigger, "/gripper/open", self._act)
+        session.serve(Trigger, "/gripper/is_open", self._is_open)
+        session.serve(ChangeState, "/camera/change_state", self._act)
+        session.serve(GetState, "/camera/get_state", self._state)
+        session.serve(SetParameters, "/lift/set_parameters", self._act)
+        session.serve(GetParameters, "/lift/get_parameters", self._height)
+
+    def end(self) -> None:
+        for call in self._kept:
+            call.respond(call.response)
+
+    def _act(self, call: rosasync.ServiceCall[Any, Any]) -> None:
+        self.asked += 1
+        first = self.asked == 1
+        if not (first and self._lost == "request"):
+            self.done += 1
+        if first:
+            self._kept.append(call)
+        elif isinstance(call.response, SetParameters.Response):
+            call.respond({"results": [{"successful": True}]})
+        else:
+            call.respond({"success": True})
+
+    def _is_open(self, request: Any, response: Any) -> Any:
+        response.success = self.done > 0
+        return response
+
+    def _state(self, request: Any, response: Any) -> Any:
+        response.current_state.id = 2 if self.done else 1
+        return response
+
+    def _height(self, request: Any, response: Any) -> Any:
+        return {"values": [{"type": 3, "double_value": 0.5 if self.done else 0.0}]}

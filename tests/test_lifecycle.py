@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 import rosasync
-from rosasync import ServiceCall, ServiceServer, Session
+from rosasync import Retry, ServiceCall, ServiceServer, Session
 from rosasync.lifecycle import (
     LifecycleClient,
     LifecycleState,
@@ -20,6 +20,7 @@ from rosasync.lifecycle import (
     TransitionFailed,
     TransitionTimeout,
 )
+from tests.support.fake_graph import FakeGraph
 from tests.support.managed import NodesProcess
 from tests.support.times import LIMIT, TICK, until
 
@@ -208,6 +209,104 @@ def test_the_errors_are_copied_and_pickled(kind: type[TransitionError]) -> None:
         assert type(twin) is kind
         assert (str(twin), twin.node_name, twin.transition) == ("no", "/a", "cleanup")
         assert twin.state is LifecycleState.ACTIVE
+
+
+class LossyNode:
+    """A node in memory that configures, and loses requests or its responses.
+
+    Attributes:
+        asked: how often a transition has reached it.
+        made: how often it was made.
+        state: the number of its state.
+    """
+
+    def __init__(self, session: Session, lost: str, then: int = 2) -> None:
+        self.asked = self.made = 0
+        self.state = 1
+        self._lost = lost
+        self._then = then
+        self._kept: list[ServiceCall[Any, Any]] = []
+        session.serve(CHANGE, "/lossy/change_state", self._change)
+        session.serve(STATE, "/lossy/get_state", self._tell)
+
+    def _change(self, call: ServiceCall[Any, Any]) -> None:
+        self.asked += 1
+        first = self.asked == 1
+        if not (first and self._lost == "request"):
+            self.made += 1
+            self.state = self._then
+        call.response.success = self.state == 2
+        if first:
+            self._kept.append(call)
+        else:
+            call.respond(call.response)
+
+    def _tell(self, request: Any, response: Any) -> Any:
+        response.current_state.id = self.state
+        return response
+
+    def end(self) -> None:
+        """Answer what was kept, so that no call is dropped."""
+        for call in self._kept:
+            call.respond(call.response)
+
+
+class TestRetry:
+    @pytest.fixture
+    async def lossy(self, fake_graph: FakeGraph) -> AsyncIterator[tuple[Session, Session]]:
+        async with fake_graph.session() as server, fake_graph.session(timeout=LIMIT) as client:
+            yield server, client
+
+    @pytest.mark.parametrize("lost", ["request", "response"])
+    async def test_a_transition_is_made_once(
+        self, lossy: tuple[Session, Session], lost: str
+    ) -> None:
+        server, client = lossy
+        node = LossyNode(server, lost)
+        state = await LifecycleClient(client, "/lossy", retry=Retry(after=TICK)).configure()
+        assert state is LifecycleState.INACTIVE
+        assert node.made == 1
+        assert node.asked == (2 if lost == "request" else 1)
+        node.end()
+
+    async def test_it_waits_for_the_end_of_a_transition(
+        self, lossy: tuple[Session, Session]
+    ) -> None:
+        server, client = lossy
+        node = LossyNode(server, "response", then=LifecycleState.CONFIGURING.id)
+        camera = LifecycleClient(client, "/lossy", retry=Retry(after=TICK))
+        task = asyncio.create_task(camera.configure())
+        await until(lambda: node.asked)
+        await asyncio.sleep(4 * TICK)
+        assert not task.done()
+        node.state = LifecycleState.INACTIVE.id
+        assert await task is LifecycleState.INACTIVE
+        assert node.asked == 1
+        node.end()
+
+    async def test_another_state_is_a_failure(self, lossy: tuple[Session, Session]) -> None:
+        server, client = lossy
+        node = LossyNode(server, "response", then=LifecycleState.FINALIZED.id)
+        with pytest.raises(TransitionFailed, match="it is finalized"):
+            await LifecycleClient(client, "/lossy", retry=Retry(after=TICK)).configure()
+        assert node.asked == 1
+        node.end()
+
+    async def test_it_is_sent_once_by_default(self, lossy: tuple[Session, Session]) -> None:
+        server, client = lossy
+        node = LossyNode(server, "request")
+        with pytest.raises(TransitionTimeout):
+            await LifecycleClient(client, "/lossy").configure(timeout=4 * TICK)
+        assert node.asked == 1
+        node.end()
+
+    async def test_it_asks_the_node_itself(self, lossy: tuple[Session, Session]) -> None:
+        async def verify() -> None: ...
+
+        with pytest.raises(ValueError, match="leave out verify"):
+            LifecycleClient(lossy[1], "/lossy", retry=Retry(verify=verify))
+        with pytest.raises(TypeError, match=r"retry must be a rosasync\.Retry"):
+            LifecycleClient(lossy[1], "/lossy", retry=3)  # type: ignore[arg-type]
 
 
 def in_flight(session: Session, name: str) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import pickle
+import random
 from collections.abc import AsyncIterator
 from typing import Any
 
@@ -26,7 +27,7 @@ from tests.support.clients import ClientProcess
 from tests.support.echo import ECHO, answer_to, request_of
 from tests.support.fake_graph import FakeGraph
 from tests.support.serving import AnyCall, Gate, Holder, ask, echo_call, echo_of
-from tests.support.times import LIMIT, until
+from tests.support.times import LIMIT, TICK, until
 
 MANY = Limits(in_flight=100, server_depth=None)
 
@@ -163,6 +164,72 @@ async def test_waiting_requests_of_callers_that_left_are_not_run(world: World) -
     assert [answer_to(response) for response in answers] == [str(n) for n in range(0, 20, 2)]
     assert ran == [str(number) for number in range(0, 20, 2)]
     assert server.statistics().waiting == 0
+
+
+async def test_a_departure_that_comes_before_its_request(
+    fake_graph: FakeGraph, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with fake_graph.session() as server, fake_graph.session(limits=MANY) as client:
+        world = World(server, client)
+        ran: list[str] = []
+
+        def handler(call: AnyCall) -> Any:
+            ran.append(call.request.load_namespace)
+            return echo_of(call.request)
+
+        served = await world.serve(handler)
+        held: list[Any] = []
+        with monkeypatch.context() as patch:
+            patch.setattr(fake_graph, "carry_request", lambda *request: held.append(request))
+            left, stays = world.call("left"), world.call("stays")
+            left.cancel()
+            await until(left.done)
+            # Let the departure arrive.
+            await asyncio.sleep(TICK)
+        for request in held:
+            fake_graph.carry_request(*request)
+        assert answer_to(await stays) == "stays"
+        assert ran == ["stays"]
+        assert (served.statistics().abandoned, served.statistics().unanswered) == (1, 0)
+
+
+@pytest.mark.parametrize("count", [100, pytest.param(1000, marks=pytest.mark.slow)])
+async def test_callers_that_leave_at_random(world: World, count: int) -> None:
+    choose = random.Random(1)
+    ran_for_nobody: list[str] = []
+    runs = 0
+
+    async def work(call: AnyCall) -> Any:
+        await asyncio.sleep(choose.random() * TICK / 10)
+        return echo_of(call.request)
+
+    def handler(call: AnyCall) -> Any:
+        nonlocal runs
+        runs += 1
+        # If the server knows of it: a departure is under way for a moment.
+        if call.abandoned:
+            ran_for_nobody.append(call.request.load_namespace)
+        return work(call)
+
+    server = await world.serve(handler, concurrency=10)
+    calls = {str(number): world.call(str(number)) for number in range(count)}
+    for text in choose.sample(sorted(calls), count):
+        if choose.random() < 0.5:
+            calls[text].cancel()
+        if choose.random() < 0.3:
+            await asyncio.sleep(choose.random() * TICK / 10)
+    done = await asyncio.gather(*calls.values(), return_exceptions=True)
+    for text, result in zip(calls, done, strict=True):
+        assert isinstance(result, asyncio.CancelledError) or answer_to(result) == text
+    assert not ran_for_nobody
+    await until(lambda: server.statistics().waiting == server.statistics().running == 0)
+    await until(lambda: server.statistics().unanswered == 0)
+    statistics = server.statistics()
+    assert runs <= statistics.taken <= count
+    pool = world.client.pool.service(ECHO, "/told", None)
+    await until(lambda: all(client.window.taken == 0 for client in pool.clients))
+    assert (pool.statistics().in_flight, pool.statistics().waiting) == (0, 0)
+    assert answer_to(await world.call("after")) == "after"
 
 
 async def test_a_running_call_learns_that_its_caller_has_left(world: World) -> None:
@@ -325,6 +392,21 @@ class TestVerify:
         _, second = await holder.held(2)
         second.respond(echo_of(second.request))
         assert answer_to(await task) == "x"
+
+    async def test_a_mapping_is_an_answer(self, world: World) -> None:
+        async def verify() -> Any:
+            return {"message": "had run"}
+
+        await world.serve(Holder())
+        assert answer_to(await world.call(retry=Retry(after=0.05, verify=verify))) == "had run"
+
+    async def test_anything_else_is_an_error(self, world: World) -> None:
+        async def verify() -> Any:
+            return False
+
+        await world.serve(Holder())
+        with pytest.raises(TypeError, match=r"Retry\.verify returned no response: expected .*bool"):
+            await world.call(retry=Retry(after=0.05, verify=verify))
 
     async def test_its_error_is_the_calls(self, world: World) -> None:
         async def verify() -> None:

@@ -17,6 +17,7 @@ import pytest
 from rosasync import (
     AsyncServiceProxy,
     CallEnd,
+    HandlerFailed,
     Limits,
     PoolFull,
     ProxyState,
@@ -543,3 +544,20 @@ async def test_every_start_has_one_end(fake_graph: FakeGraph, seed: int) -> None
     assert outcomes.count("timed out") == statistics.timed_out
     assert outcomes.count("cancelled") == statistics.cancelled
     assert outcomes.count("failed") == statistics.failed
+
+
+async def test_what_a_server_reports_is_the_end_of_a_call(
+    fake_graph: FakeGraph, trace: Recorder
+) -> None:
+    def fail(call: AnyCall) -> Any:
+        raise LookupError("no")
+
+    async with fake_graph.session() as server, fake_graph.session(trace=trace) as client:
+        server.serve(ECHO, "/served", fail, status=True)
+        # The first call may fail before both sides have found each other's topics.
+        with pytest.raises(HandlerFailed):
+            await ask(client, "/served", "x", timeout=LIMIT)
+    assert trace.of("client")[-1].endswith("sent > failed")
+    error = trace.error("client")
+    assert isinstance(error, HandlerFailed)
+    assert error.error_type == "LookupError"

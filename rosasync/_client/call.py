@@ -23,7 +23,14 @@ __all__ = ["Call", "CallOwner"]
 
 
 class CallOwner(Protocol):
-    """What a call reports to its service."""
+    """What a call needs to know of its service, and reports to it."""
+
+    def make_response(self, value: object) -> Any:
+        """Return the response in a value that `Retry.verify` has returned.
+
+        Raises:
+            TypeError, ValueError: it is neither a response nor a mapping of its fields.
+        """
 
     def send_again(self, call: Call) -> None:
         """Send a call again as soon as there are a server and a place."""
@@ -289,10 +296,19 @@ class Call:
             self.future.set_exception(UsageError("Retry.verify was cancelled"))
         elif (error := task.exception()) is not None:
             self.future.set_exception(error)
-        elif task.result() is not None:
-            self.future.set_result(task.result())
-        else:
+        elif (found := task.result()) is None:
             self.owner.send_again(self)
+        else:
+            self._answer(found)
+
+    def _answer(self, found: object) -> None:
+        """End the call with what `Retry.verify` has found."""
+        try:
+            self.future.set_result(self.owner.make_response(found))
+        except (TypeError, ValueError) as error:
+            self.future.set_exception(
+                type(error)(f"Retry.verify returned no response: {error}; None sends it again")
+            )
 
 
 async def _verify(verify: Callable[[], Awaitable[Any]]) -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol
 
 from rosasync._client.clients import Clients
@@ -124,6 +125,7 @@ class Dispatch:
         self.leased: dict[Call, None] = {}
         # Each caller that waits for a match, with the client to be matched: None for any client.
         self._match_waiters: dict[asyncio.Future[None], Client | None] = {}
+        self._make_response = partial(node.make_message, service.srv_type.Response)
         self._limits = limits
         self._watch = watch
         self._errors = errors
@@ -206,6 +208,14 @@ class Dispatch:
         """Send a call again as soon as there are a server and a place."""
         self.resends[call] = None
         self.schedule()
+
+    def make_response(self, value: object) -> Any:
+        """Return the response in a value that `Retry.verify` has returned.
+
+        Raises:
+            TypeError, ValueError: it is neither a response nor a mapping of its fields.
+        """
+        return self._make_response(value)
 
     def remove(self, call: Call) -> None:
         """Remove a call wherever it waits, because its caller leaves."""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from rosasync.errors import InvalidServiceName
 
 if TYPE_CHECKING:
+    from rosasync.options import Retry
     from rosasync.session import Session
     from rosasync.typing import Timeout
 
@@ -52,11 +53,17 @@ class NodeClient:
         return self._node_name
 
     async def _call_node(
-        self, srv_type: str, service: str, request: Mapping[str, Any], timeout: Timeout
+        self,
+        srv_type: str,
+        service: str,
+        request: Mapping[str, Any],
+        timeout: Timeout,
+        retry: Retry | None = None,
     ) -> Any:
         return await self._session.call(
             srv_type,
             f"{self._node_name}/{service}",
             request,
             timeout=self._timeout if timeout is ... else timeout,
+            retry=retry,
         )

@@ -25,10 +25,10 @@ class CallStatus:
 
     __slots__ = ("_report", "abandoned", "client", "number", "task")
 
-    def __init__(self, client: bytes, number: int, report: TellCaller) -> None:
+    def __init__(self, client: bytes, number: int, report: TellCaller, abandoned: bool) -> None:
         self.client = client
         self.number = number
-        self.abandoned = False
+        self.abandoned = abandoned
         self.task: asyncio.Task[None] | None = None
         self._report = report
 

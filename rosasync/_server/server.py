@@ -323,6 +323,9 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         if self._status is not None:
             number = header.request_id.sequence_number
             call.status = self._status.take(call, self._port.client_of(header), number)
+            if call.abandoned:
+                self._drop_abandoned(call)
+                return
         if not self._starter.start_now(call):
             self._intake.put(call, self._port.client_of(header), _waited(header))
             self._starter.start_waiting()
@@ -341,13 +344,16 @@ class ServiceServer(Generic[RequestT, ResponseT]):
     def _on_abandoned(self, call: ServiceCall[RequestT, ResponseT]) -> None:
         """Drop a call whose caller has left, or cancel its handler if that is wished."""
         if self._intake.remove(call):
-            self._counts.abandoned += 1
-            call.give_up("dropped: its caller has left", Outcome.DROPPED)
+            self._drop_abandoned(call)
             return
         task = call.status.task if call.status is not None else None
         if self._cancel_abandoned and task is not None:
             self._counts.abandoned += 1
             task.cancel()
+
+    def _drop_abandoned(self, call: ServiceCall[RequestT, ResponseT]) -> None:
+        self._counts.abandoned += 1
+        call.give_up("dropped: its caller has left", Outcome.DROPPED)
 
     # Ending.
 

@@ -64,7 +64,10 @@ class ServerStatus:
         reporter.join(self, self._identity, self._on_departure)
 
     def take(self, call: ServiceCall[Any, Any], client: Hashable, number: int) -> CallStatus | None:
-        """Follow a call, if the middleware identifies its client."""
+        """Follow a call, if the middleware identifies its client.
+
+        Its caller may have left: what it said of that may have come before the request.
+        """
         known = identity_bytes(client)
         if known is None or self._identity is None:
             return None
@@ -72,7 +75,7 @@ class ServerStatus:
         if known not in self._known and not self._looking:
             self._looking = True
             self._loop.call_soon(self.on_graph)
-        return CallStatus(known, number, self._report)
+        return CallStatus(known, number, self._report, self._reporter.has_left(known, number))
 
     def on_graph(self) -> None:
         """Find out which clients have left the graph, with calls that are not settled."""

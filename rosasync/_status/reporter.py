@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import OrderedDict
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -34,6 +35,8 @@ class Reporter:
     def __init__(self, node: NodePort) -> None:
         self._node = node
         self._on_departures: dict[object, Callable[[Departure], None]] = {}
+        # The last ones. Requests come another way, and may come later than the departures.
+        self._departed: OrderedDict[tuple[bytes, int], None] = OrderedDict()
         self._process: str | None = None
         self._reports: PublisherPort | None = None
         self._departures: SubscriptionPort | None = None
@@ -85,6 +88,10 @@ class Reporter:
             message = self._node.make_message(self._type, report.to_mapping())
             self._reports.publish(message)
 
+    def has_left(self, client: bytes, number: int) -> bool:
+        """Return whether the caller of a request that arrives now has left already."""
+        return (client, number) in self._departed
+
     def _is_heard(self) -> bool:
         try:
             return self._reports is not None and self._reports.subscriptions() > 0
@@ -97,5 +104,8 @@ class Reporter:
         except ValueError as error:
             logger.debug("a message on the topic of departures is none: %s", error)
             return
+        self._departed[departure.client, departure.number] = None
+        if len(self._departed) > BURST.depth:
+            self._departed.popitem(last=False)
         for on_departure in tuple(self._on_departures.values()):
             on_departure(departure)

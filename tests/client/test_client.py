@@ -56,6 +56,9 @@ class ClientUnderTest:
     def send_again(self, call: Call) -> None:
         call.send_again(asyncio.get_running_loop().time())
 
+    def make_response(self, value: object) -> Any:
+        return value
+
     def callers_wait(self) -> bool:
         return bool(self.queue)
 
