@@ -6,6 +6,7 @@ import math
 from collections import deque
 from typing import TYPE_CHECKING
 
+from rosasync._client.pace import RECENT, Measured, Pace
 from rosasync._client.response_times import ResponseTimes
 
 if TYPE_CHECKING:
@@ -14,15 +15,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Window"]
 
-RECENT = 100
-"""The number of response times from which the next one is estimated. Those of a full window
-overlap, so a hundred of them hold about ten that are independent of each other."""
-FEW = 3
-"""Fewer response times than these say nothing."""
-STALE = 10.0
-"""Seconds after which a response time says nothing any more, beyond its own length."""
-DEVIATIONS = 2.0
-"""So many standard deviations above the mean, one response time in forty is longer."""
 TIMED = 16
 """The first requests are timed, and then one of this many."""
 
@@ -74,6 +66,7 @@ class Window:
         "_leaving",
         "_outdated",
         "_outdated_since",
+        "_pace",
         "_recent",
         "abandoned",
         "answered",
@@ -98,10 +91,9 @@ class Window:
         self.servers: Servers = frozenset()
         self.times = ResponseTimes()
         self._grace = grace
-        # The last response times: when each was measured, how long it was, how many places were
-        # taken when its request was sent, and for how long the server worked on it: from its send
-        # or the answer before, whichever is later, to its answer.
-        self._recent: deque[tuple[float, float, int, float]] = deque(maxlen=RECENT)
+        self._recent: deque[Measured] = deque(maxlen=RECENT)
+        # What they say, until the next answer: one batch of answers lets many callers go.
+        self._pace: Pace | None = None
         self._last_answer = 0.0
         # The requests without a caller, each with the time until which it is remembered. Requests
         # that have been answered in the meantime are dropped when they come to the front.
@@ -219,6 +211,7 @@ class Window:
         work = now - max(sent.at, self._last_answer)
         self._last_answer = now
         self._recent.append((now, seconds, sent.out, work))
+        self._pace = None
         if number <= TIMED or not number % TIMED:
             self.times.add(seconds)
         if number in self._outdated:
@@ -246,6 +239,7 @@ class Window:
         if came:
             # The new server may be quicker.
             self._recent.clear()
+            self._pace = None
         for sent in self.sent.values():
             if not sent.servers:
                 sent.servers = servers
@@ -266,34 +260,10 @@ class Window:
         ]
 
     def expected(self, now: float) -> float:
-        """Return the seconds until a request that is sent now is answered, at most; 0 if unknown.
-
-        If the server works on one request after another, it works on each that is out for the mean
-        of the recent times. Its answers deviate from that: what counts is by how much, for each
-        request that was out. The deviations of several requests add up as their squares, and the
-        mean is not known exactly either. That gives the interval in which the next response time
-        lies. A quantile of the response times would be too low: those of a full window share the
-        same work, so a few of them say little of what is rare.
-
-        If it works on several at once, that is too much. So it is not more than the longest recent
-        response time, reduced to the places that are taken now.
-        """
-        recent = [
-            (seconds, then, work)
-            for measured, seconds, then, work in self._recent
-            if now - measured <= STALE + seconds
-        ]
-        count = len(recent)
-        if count < FEW:
-            return 0.0
-        out = self.taken + 1
-        mean = sum(work for _, _, work in recent) / count
-        # The variance that each request adds.
-        variance = sum((seconds - then * mean) ** 2 / then for seconds, then, _ in recent) / count
-        interval = out * mean + DEVIATIONS * math.sqrt(variance * out * (1 + out / count))
-        longest = max(seconds * min(1.0, out / then) for seconds, then, _ in recent)
-        # And one more, for what the server may get from others in the meantime.
-        return min(interval, max(longest, out * mean)) + mean
+        """Return the seconds to the answer of a request that is sent now, at most; 0 if unknown."""
+        if self._pace is None or now > self._pace.until:
+            self._pace = Pace.of(self._recent, now)
+        return self._pace.expected(self.taken + 1)
 
     def due(self, callers_wait: bool, resend: Sent | None) -> float:
         """Return the time at which `on_time` has something to do; infinite if it never has.

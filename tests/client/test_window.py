@@ -8,9 +8,10 @@ from typing import Any
 
 import pytest
 
+from rosasync._client.pace import RECENT, STALE
 from rosasync._client.response_times import PATIENCE_INITIAL, PATIENCE_MIN, ResponseTimes
 from rosasync._client.sent import Sent
-from rosasync._client.window import RECENT, STALE, Window
+from rosasync._client.window import Window
 
 GRACE = 100.0
 
