@@ -174,8 +174,10 @@ def section(trials: Trials) -> str:
     for what in WHAT:
         for server in SERVERS:
             ours, stock = (_median(figures, what, client, server) for client in CLIENTS)
-            ratio = f"{ours / stock:.2g}" if ours and stock and what != GROWTH else "-"
-            table.append([what, server, _text(ours), _text(stock), ratio])
+            ratio = f"{ours / stock:.2g}" if ours and stock else "-"
+            # The growth is measured for rosasync's client alone.
+            theirs = "-" if what == GROWTH else _text(stock)
+            table.append([what, server, _text(ours), theirs, ratio])
     return "\n".join(
         (
             "## Actions\n",

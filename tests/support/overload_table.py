@@ -4,8 +4,8 @@
 
     python -m tests.support.overload_table --timeouts 0.1,mixed --processes 1,4
 
-Beside the clients stands the best that is possible without knowing how long a request will take: a
-server that knows the callers, and always works for the one who has the most time left.
+Beside the clients stands a mark to compare with, though not a bound: a server that knows the
+callers, and always works for the one who has the most time left.
 """
 
 from __future__ import annotations
