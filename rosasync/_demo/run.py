@@ -223,7 +223,7 @@ async def run_demo(*, calls: int = 2000, seconds: float = 8.0, as_json: bool = F
     except rosasync.RosasyncError as error:
         raise DemoError(f"{type(error).__name__}: {error}") from error
     except TimeoutError as error:
-        raise DemoError(f"timed out: {error or 'the machine may be busy'}") from error
+        raise DemoError(f"timed out: {str(error) or 'the machine may be busy'}") from error
     if as_json:
         print(report.as_json())
         return
