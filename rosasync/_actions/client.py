@@ -15,7 +15,6 @@ from rosasync._actions.results import ResultRequests
 from rosasync._actions.status import TERMINAL, GoalStatus, read_statuses, uuid_bytes, uuid_of
 from rosasync._core.aio import start_task
 from rosasync._core.ports import TopicQos
-from rosasync._core.text import count
 from rosasync.errors import (
     CallError,
     CancelRejected,
@@ -133,7 +132,7 @@ class ActionClient:
         self._gone_timer: asyncio.TimerHandle | None = None
 
     def __repr__(self) -> str:
-        return f"<ActionClient {self.action.name} {count(len(self._goals), 'goal')}>"
+        return f"<ActionClient {self.action.name} {len(self._goals)} goals>"
 
     @property
     def goals(self) -> tuple[ActiveGoal, ...]:

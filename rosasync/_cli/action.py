@@ -102,8 +102,8 @@ def type_of(
 async def _type_of(name: str, as_json: bool, timeout: float) -> None:
     async with open_session() as session:
         types = await wait_for_types(session, name, timeout)
-        if not types:
-            raise no_server(session, name, timeout)
+    if not types:
+        raise no_server(name, timeout)
     if as_json:
         print_json({"name": name, "types": types})
     else:
@@ -225,7 +225,7 @@ async def _cancel(
     async with open_session(timeout) as session:
         # Its absence is reported by the action's name.
         if not await wait_for_types(session, name, timeout):
-            raise no_server(session, name, timeout)
+            raise no_server(name, timeout)
         response: Any = await session.call(
             "action_msgs/srv/CancelGoal", f"{name}/_action/cancel_goal", request
         )

@@ -85,7 +85,11 @@ async def find_type(session: rosasync.Session, name: str, timeout: float) -> str
     """
     types = await wait_for_types(session, name, timeout)
     if not types:
-        raise no_server(session, name, timeout)
+        raise CliError(
+            f"{name}: no server within {timeout:g} s, so its type is not known. Give the TYPE, or "
+            "try: rosasync action list",
+            Code.NO_SERVER,
+        )
     if len(types) > 1:
         raise CliError(f"{name} is served with several types: give one of {', '.join(types)}")
     return types[0]
@@ -110,13 +114,8 @@ def action_class(name: str) -> Any:
         raise CliError(explain_type(name, error)) from None
 
 
-def no_server(session: rosasync.Session, name: str, timeout: float) -> CliError:
-    """Return the error for an action that has no server; it lists the similar names."""
-    from rosasync._ros.graph import describe_similar
-
-    similar = describe_similar(actions_of(session), resolve(session, name))
-    instead = f"; there are {similar}" if similar else ""
+def no_server(name: str, timeout: float) -> CliError:
+    """Return the error for an action that has no server."""
     return CliError(
-        f"{name}: no server of this name within {timeout:g} s{instead}. Try: rosasync action list",
-        Code.NO_SERVER,
+        f"{name}: no server within {timeout:g} s. Try: rosasync action list", Code.NO_SERVER
     )

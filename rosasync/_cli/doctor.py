@@ -69,12 +69,9 @@ async def _doctor(as_json: bool) -> int:
     report.add("python", True, f"{platform.python_version()}, {sys.executable}")
     if _rclpy(report) and _middleware(report):
         environment(report)
-        fast_dds = _is_fast_dds()
-        if fast_dds:
-            _shared_memory(report)
+        _shared_memory(report)
         _multicast(report)
-        if fast_dds:
-            _profile(report)
+        _profile(report)
         if "domain" not in report.failed and _ports(report):
             await _calls(report)
     return Code.FAILED if report.failed else Code.ANSWERED
@@ -105,12 +102,6 @@ def _middleware(report: Report) -> bool:
     return True
 
 
-def _is_fast_dds() -> bool:
-    from rosasync._ros import fastdds
-
-    return fastdds.is_present()
-
-
 def _shared_memory(report: Report) -> None:
     """Check that Fast DDS can use shared memory; without it, it falls back to UDP."""
     usable = os.access(FOLDER, os.W_OK | os.X_OK)
@@ -127,7 +118,9 @@ def _shared_memory(report: Report) -> None:
 
 def _ports(report: Report) -> bool:
     """Check the ports in shared memory; return whether a new node can be created."""
-    if not _is_fast_dds():
+    from rosasync._ros.inspect import middleware
+
+    if "fastrtps" not in middleware():
         return True
     domain = environment_domain()
     left = unfinished_ports(domain)

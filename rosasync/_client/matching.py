@@ -6,8 +6,6 @@ import asyncio
 import logging
 from typing import TYPE_CHECKING, Protocol
 
-from rosasync._core.text import count
-
 if TYPE_CHECKING:
     from rosasync._client.graph_watch import GraphWatch
     from rosasync._core.ports import NodePort, Servers, Service
@@ -75,11 +73,11 @@ class Matching:
 
     def count_servers(self) -> None:
         """Count the servers of the name. Call it after every change of the graph."""
-        servers = self._node.count_servers(self._service)
-        if servers != self.count:
+        count = self._node.count_servers(self._service)
+        if count != self.count:
             name = self._service.key.srv_name
-            logger.debug("%s: the graph shows %s", name, count(servers, "server"))
-        self.count = servers
+            logger.debug("%s: the graph shows %d server%s", name, count, "" if count == 1 else "s")
+        self.count = count
 
     def learn(self) -> None:
         """Query the servers, unless that was done in this generation, and pass them on."""
@@ -98,10 +96,8 @@ class Matching:
         return not self._owner.any_ready() and not self.provided()
 
     def warn_of_several(self) -> None:
-        """Warn if there are more servers than ever, without those that have crashed."""
-        if len(self.servers) <= self._most:
-            return
-        servers = len(self.servers - self._node.find_ended(self.servers))
+        """Warn if there are more servers than ever."""
+        servers = len(self.servers)
         if servers > self._most:
             self._most = servers
             names = self._node.name_servers(self._service)

@@ -13,7 +13,6 @@ from rosasync._client.latency import summarize
 from rosasync._client.service import MATCH_TIMEOUT, ServicePool
 from rosasync._client.service_watch import ServiceState, watch_servers
 from rosasync._core.aio import Deadlines
-from rosasync._core.text import count
 from rosasync._status.listener import Listener
 from rosasync.errors import UsageError
 from rosasync.options import check_count, check_limits, check_timeout
@@ -70,8 +69,7 @@ class ClientPool:
     def __repr__(self) -> str:
         total = self.statistics()
         return (
-            f"<ClientPool {count(len(self._services), 'service')}, "
-            f"{count(total.clients, 'client')}, "
+            f"<ClientPool {len(self._services)} services, {total.clients} clients, "
             f"{total.idle} idle, {total.in_flight} in flight, {total.waiting} waiting>"
         )
 

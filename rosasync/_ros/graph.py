@@ -20,10 +20,9 @@ from rclpy.qos import QoSProfile
 from rclpy.waitable import NumberOfEntities, Waitable
 
 from rosasync._core.ports import Service
-from rosasync._core.text import count
 from rosasync._ros.endpoints import (
     Endpoint,
-    identified_servers,
+    gid_of,
     incompatibility,
     response_writers,
     servers_of,
@@ -145,9 +144,10 @@ class GraphQueries:
         """Identify the servers that fit; see `rosasync._core.ports.NodePort.find_servers`."""
         name, srv_type, _ = service.key
         with uses_node(self._node):
-            if found := identified_servers(self._node, name):
+            if writers := response_writers(self._node, name):
                 qos = service.qos or default_qos()
-                return frozenset(s.gid for s in found if serves(s, service, qos))
+                return frozenset(gid_of(w) for w in writers if serves(w, service, qos))
+            # Another middleware than Fast DDS may name the topics otherwise.
             servers = self._count_servers(name)
             if servers and srv_type in self._services().get(name, ()):
                 return frozenset(range(servers))
@@ -172,8 +172,8 @@ class GraphQueries:
         if similar := describe_similar(services, srv_name, srv_type):
             return f"no server has this name; there are {similar}"
         return (
-            f"no server has this name or a similar one, among {count(len(services), 'service')} of "
-            "other nodes: start the server, or compare its name and namespace"
+            f"no server has this name or a similar one, among {len(services)} services of other "
+            "nodes: start the server, or compare its name and namespace"
         )
 
     def explain_mismatch(self, service: Service) -> str | None:

@@ -27,13 +27,12 @@ from rosasync._core.ports import (
     DeliverMessage,
     DeliverRequest,
     PublisherPort,
-    Servers,
     Service,
     ServicePort,
     SubscriptionPort,
     TopicQos,
 )
-from rosasync._ros import configuration, discovery, fastdds, names, profile, rcl
+from rosasync._ros import configuration, discovery, names, profile, rcl
 from rosasync._ros.direct_bridge import DirectBridge
 from rosasync._ros.domain import check_domain, environment_domain
 from rosasync._ros.endpoints import gid_of, response_readers, response_writers
@@ -49,7 +48,6 @@ from rosasync._ros.failures import (
     uses_node,
 )
 from rosasync._ros.graph import GraphQueries, GraphWaitable
-from rosasync._ros.host import ended
 from rosasync._ros.identities import Identities
 from rosasync._ros.messages import make_message
 from rosasync._ros.shared_memory import check_ports
@@ -179,9 +177,7 @@ class RosNode:
                 _qos_of(service, self._client_depth(service)),
                 deliver,
             )
-            client.identity = self._identities.confirm(
-                client.handle, service.key.srv_name, created()
-            )
+            client.identity = created()
         except RclpyError as error:
             raise refusal(self._node, service, "client", error) from error
         return client
@@ -256,11 +252,6 @@ class RosNode:
     def find_servers(self, service: Service) -> frozenset[Hashable]:
         """Identify the servers that fit: by name, type and QoS."""
         return self._graph.find_servers(service)
-
-    def find_ended(self, servers: Servers) -> Servers:
-        """Return those of these servers whose process has certainly ended."""
-        with uses_node(self._node):
-            return ended(self._node, (gid for gid in servers if isinstance(gid, bytes)))
 
     def find_publishers(self, topic_name: str) -> frozenset[Hashable]:
         """Identify the publishers of a topic, in all processes."""
@@ -380,7 +371,7 @@ class RosNode:
             environment_domain()
             context = self._own_context = Context()
             rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
-        if not fastdds.is_present():
+        if "fastrtps" not in rclpy.get_rmw_implementation_identifier():
             return Node(name, context=context)
         domain = context.get_domain_id()
         check_domain(domain)
