@@ -303,7 +303,7 @@ async def test_a_forged_report_of_another_server_ends_nothing(world: World) -> N
     (server,) = world.client.core.node.find_servers(pool.service)
     assert isinstance(server, bytes)
     forger = world.server.core.node.open_publisher(
-        DiagnosticStatus, report_topic(str(process_of(server))), TopicQos()
+        DiagnosticStatus, report_topic(str(process_of(server))), TopicQos(latched=True)
     )
     client = pool.clients[0].identity
     assert isinstance(client, bytes)
@@ -327,7 +327,7 @@ async def test_a_server_does_not_take_part_because_another_process_says_so(world
     (server,) = world.client.core.node.find_servers(pool.service)
     # The client's own process is another than the server's.
     forger = world.client.core.node.open_publisher(
-        DiagnosticStatus, report_topic(str(process_of(server))), TopicQos()
+        DiagnosticStatus, report_topic(str(process_of(server))), TopicQos(latched=True)
     )
     topic = report_topic(str(process_of(server)))
     await until(lambda: world.client.core.node.find_publishers(topic))
