@@ -5,12 +5,12 @@ Everything of rclpy happens in the one thread that spins: Jazzy's action client 
 
 from __future__ import annotations
 
+import asyncio
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, TypeVar
 
-from tests.support.child import Unanswered
 from tests.support.executor import run_in, spin
 from tests.support.process import NodeProcess
 from tests.support.times import LIMIT
@@ -38,11 +38,7 @@ class ActionClientProcess(NodeProcess):
         Returns:
             Its id in hexadecimal digits; None if it was rejected.
         """
-        try:
-            result: str | None = await self.ask("send", name=name, order=order)
-        except Unanswered:
-            self.restart()
-            result = await self.ask("send", name=name, order=order)
+        result: str | None = await asyncio.to_thread(self.ask_first, "send", name=name, order=order)
         return result
 
     async def ended(self, goal: str) -> Ended:

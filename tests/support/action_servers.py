@@ -14,7 +14,7 @@ from contextlib import suppress
 from typing import Any, Literal
 from uuid import UUID
 
-from tests.support.child import Unanswered, serve_commands
+from tests.support.child import serve_commands
 from tests.support.executor import run_in
 from tests.support.process import NodeProcess
 from tests.support.times import LIMIT
@@ -85,11 +85,7 @@ class ActionServerProcess(NodeProcess):
             "ignored_asks": ignored_asks,
             "idle": idle,
         }
-        try:
-            self.ask_now("serve", patience=LIMIT, **arguments)
-        except Unanswered:
-            self.restart()
-            self.ask_now("serve", **arguments)
+        self.ask_first("serve", patience=LIMIT, **arguments)
 
     async def stop(self, name: str) -> None:
         """Destroy the action server."""

@@ -6,6 +6,7 @@ blocks holds up its own node only.
 
 from __future__ import annotations
 
+import asyncio
 import itertools
 import math
 import threading
@@ -46,7 +47,7 @@ class NodesProcess(NodeProcess):
     async def add(self, kind: str, name: str = "node") -> str:
         """Create a node, and return its full name, which no other node has."""
         name = f"{name}_{next(self._numbers)}"
-        await self.ask("add", kind=kind, name=name)
+        await asyncio.to_thread(self.ask_first, "add", patience=LIMIT, kind=kind, name=name)
         return f"/stock/{name}"
 
     async def release(self) -> None:

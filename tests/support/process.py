@@ -13,7 +13,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, AnyStr, Self
 
-from tests.support.child import ROOT, Child
+from tests.support.child import ROOT, Child, Unanswered
 from tests.support.times import LIMIT
 
 __all__ = ["ROOT", "NodeProcess", "ended", "first_line", "own", "profile"]
@@ -131,6 +131,20 @@ class NodeProcess(Child):
         """
         assert self.stock
         self._start({})
+
+    def ask_first(self, command: str, *, patience: float = 4 * LIMIT, **arguments: Any) -> Any:
+        """Give it the first command of a test, once more to a new process if it is `Unanswered`.
+
+        Args:
+            command: the name of the command.
+            patience: seconds to wait for the first answer.
+            arguments: those of the command.
+        """
+        try:
+            return self.ask_now(command, patience=patience, **arguments)
+        except Unanswered:
+            self.restart()
+            return self.ask_now(command, **arguments)
 
     def kill(self, *, stacks: bool = False) -> None:
         """End it as a crash does (SIGKILL), and remove the shared memory it leaves behind.

@@ -22,7 +22,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-from tests.support.child import Unanswered
 from tests.support.echo import ECHO, fill, response_to, service_class
 from tests.support.executor import run_in, spin
 from tests.support.process import NodeProcess, ended, profile
@@ -104,11 +103,7 @@ class ServerProcess(NodeProcess):
         if self._serving:
             self.ask_now("serve", **arguments)
             return
-        try:
-            self.ask_now("serve", patience=REPLACED_AFTER, **arguments)
-        except Unanswered:
-            self.restart()
-            self.ask_now("serve", **arguments)
+        self.ask_first("serve", patience=REPLACED_AFTER, **arguments)
         self._serving = True
 
     async def stop(self, name: str) -> None:

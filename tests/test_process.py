@@ -1,0 +1,19 @@
+"""The processes of stock nodes that the tests use."""
+
+from __future__ import annotations
+
+import signal
+
+import pytest
+
+from tests.support.managed import NodesProcess
+
+
+@pytest.mark.slow
+def test_one_that_hangs_is_replaced() -> None:
+    with NodesProcess() as nodes:
+        hung = nodes.pid
+        nodes.signal(signal.SIGSTOP)
+        nodes.ask_first("add", patience=0.5, kind="lifecycle", name="first")
+        assert nodes.pid != hung
+        assert nodes.ask_now("add", kind="lifecycle", name="second") is None
