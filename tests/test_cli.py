@@ -180,6 +180,12 @@ def test_stock_server_ends_with_its_standard_input() -> None:
         assert server.wait(LIMIT) == 0
 
 
+@pytest.mark.parametrize("kind", [(), ("--bare",)])
+def test_stock_server_whose_standard_input_has_ended_before(kind: tuple[str, ...]) -> None:
+    done = run(sys.executable, "-m", "rosasync._demo.stock", *kind, "/rosasync_test/echo")
+    assert done.returncode == 0, done.stderr
+
+
 def test_figures() -> None:
     figures = Samples([1e-4 * n for n in range(1, 201)], wall=2.0, cpu=1.0).figures()
     assert figures.median_us == pytest.approx(10_050)

@@ -53,8 +53,6 @@ def serve(*srv_names: str, bare: bool = False) -> None:
     rclpy.init(context=context)
     node = rclpy.create_node("rosasync_stock_server", context=context)
     services = [node.create_service(Echo, srv_name, _echo) for srv_name in srv_names]
-    threading.Thread(target=_shut_down_at_end_of_input, args=(context,), daemon=True).start()
-    os.write(sys.stdout.fileno(), READY)
     with suppress(KeyboardInterrupt, ExternalShutdownException):
         if bare:
             _answer_in_a_loop(context, [service.handle for service in services])
@@ -64,9 +62,19 @@ def serve(*srv_names: str, bare: bool = False) -> None:
     rclpy.try_shutdown(context=context)
 
 
+def _begin(context: Context) -> None:
+    """Say that the server is ready; it may end from here on.
+
+    Called when all is made that needs the context: standard input may have ended already.
+    """
+    threading.Thread(target=_shut_down_at_end_of_input, args=(context,), daemon=True).start()
+    os.write(sys.stdout.fileno(), READY)
+
+
 def _spin(node: Any) -> None:
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
+    _begin(node.context)
     try:
         executor.spin()
     finally:
@@ -77,6 +85,7 @@ def _answer_in_a_loop(context: Context, services: list[Any]) -> None:
     guard = _rclpy.GuardCondition(context.handle)
     context.on_shutdown(guard.trigger_guard_condition)
     wait_set = _rclpy.WaitSet(0, 1, 0, 0, len(services), 0, context.handle)
+    _begin(context)
     while context.ok():
         wait_set.clear_entities()
         wait_set.add_guard_condition(guard)
