@@ -32,6 +32,7 @@ __all__ = [
     "plans",
     "row",
     "section",
+    "summarize",
 ]
 
 COMMAND = "overload"
@@ -56,6 +57,8 @@ FLOOD = 500
 POLITE_RATE, POLITE_TIMEOUT = 5.0, 1.0
 OVERLOAD, ORDINARY = 4.0, 0.8
 """The loads before and after the end of an overload."""
+RECOVERY = 1.0
+"""Seconds of ordinary load that count then."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +92,8 @@ class Cell:
         capacity: requests per second that this server can do.
         sent: the number of calls.
         answered: those that were answered in time.
-        served: requests that the server has finished.
+        within: those of them that were answered while calls were offered.
+        served: requests that the server finished while calls were offered.
         median: of the latencies of the answered in ms, as is `p99`.
         outcomes: how the calls ended.
     """
@@ -106,6 +110,7 @@ class Cell:
     capacity: float
     sent: int
     answered: int
+    within: int
     served: int
     median: float | None = None
     p99: float | None = None
@@ -113,18 +118,20 @@ class Cell:
 
     @property
     def goodput(self) -> float:
-        """Calls that were answered in time, of what the server could have answered."""
-        return self.answered / (self.capacity * self.seconds)
+        """The answers in time while calls were offered, of what the server could have answered."""
+        return self.within / (self.capacity * self.seconds)
 
     @property
     def wanted(self) -> float:
         """The calls that were answered in time, of those that could have been."""
-        return self.answered / max(1, min(self.sent, round(self.capacity * self.seconds)))
+        if self.sent < self.capacity * self.seconds:
+            return self.answered / max(1, self.sent)
+        return self.goodput
 
     @property
     def waste(self) -> float:
         """Requests that were served for callers that had left, of all that were served."""
-        return max(0, self.served - self.answered) / max(1, self.served)
+        return max(0, self.served - self.within) / max(1, self.served)
 
 
 def plans(
@@ -233,7 +240,7 @@ def _calibrate(plan: Plan, server: Child, crew: _Crew, name: str) -> float:
         run = {"callers": KEPT, "seconds": CALIBRATION, "limit": 10.0}
         begin = time.monotonic() + LEAD
         found = caller.ask_now("keep", begin=begin, **run)
-        return len(found["calls"]) / CALIBRATION
+        return _answered(found["calls"], CALIBRATION) / CALIBRATION
 
 
 def _measure(
@@ -252,7 +259,6 @@ def _measure(
         children = [ready(plan.client, number) for number in range(plan.processes)]
         flood = ready("stock", plan.processes) if plan.kind == "polite" else None
         pool = stack.enter_context(ThreadPoolExecutor(len(children) + 1))
-        before = server.ask_now("handled")
         begin = time.monotonic() + LEAD
         patience = LEAD + 2 * seconds + PATIENCE
         if flood is not None:
@@ -266,17 +272,22 @@ def _measure(
             pool.submit(child.ask_now, message.pop("do"), patience=patience, **message)
             for child, message in zip(children, messages, strict=True)
         ]
-        # What was served when the last calls may still be answered.
-        time.sleep(max(0.0, begin + _duration(plan, seconds) - time.monotonic()))
-        served = server.ask_now("handled") - before
         found = [future.result() for future in asked]
         if flood is not None:
             flooding.result()
-    return _cell(plan, capacity, seconds, served, found)
+        start, end = _interval(plan, seconds)
+        served = server.ask_now("handled", begin=begin + start, end=begin + end)
+    return summarize(plan, capacity, seconds, served, found)
 
 
-def _duration(plan: Plan, seconds: float) -> float:
-    return 2 * seconds if plan.kind == "recovery" else seconds
+def _interval(plan: Plan, seconds: float) -> tuple[float, float]:
+    """Return the seconds after the start between which calls and answers are counted."""
+    return (seconds, seconds + RECOVERY) if plan.kind == "recovery" else (0.0, seconds)
+
+
+def _answered(calls: Iterable[tuple[float, float | None]], end: float) -> int:
+    """Return how many calls were answered by a time. What follows is not of the load's seconds."""
+    return sum(took is not None and began + took <= end for began, took in calls)
 
 
 def _message(
@@ -296,26 +307,28 @@ def _message(
     phases = {
         "offered": [(rate, seconds)],
         "polite": [(POLITE_RATE, seconds)],
-        "recovery": [(rate, seconds), (ORDINARY * capacity / plan.processes, 1.0)],
+        "recovery": [(rate, seconds), (ORDINARY * capacity / plan.processes, RECOVERY)],
     }[plan.kind]
     timeouts = [POLITE_TIMEOUT] if plan.kind == "polite" else list(TIMEOUTS[plan.timeouts])
     return {"do": "offer", "phases": phases, "timeouts": timeouts, "seed": seed, "begin": begin}
 
 
-def _cell(
+def summarize(
     plan: Plan, capacity: float, seconds: float, served: int, found: Sequence[Mapping[str, Any]]
 ) -> Cell:
+    """Return the cell of a plan from what its client processes have logged."""
     calls = [call for each in found for call in each["calls"]]
-    if plan.kind == "recovery":
-        calls = [(began, took) for began, took in calls if began >= seconds]
+    start, end = _interval(plan, seconds)
+    calls = [(began, took) for began, took in calls if began >= start]
     samples = [took * 1000 for _, took in calls if took is not None]
     median, p99 = np.percentile(samples, (50, 99)) if samples else (None, None)
     return Cell(
         **dataclasses.asdict(plan),
-        seconds=1.0 if plan.kind == "recovery" else seconds,
+        seconds=end - start,
         capacity=capacity,
         sent=len(calls),
         answered=len(samples),
+        within=_answered(calls, end),
         served=served,
         median=None if median is None else float(median),
         p99=None if p99 is None else float(p99),
@@ -451,9 +464,9 @@ def section(trials: Trials, picture: str) -> str:
             f"![goodput over the offered load]({picture})\n",
             f"`python -m benchmarks overload`. {trials.conditions} "
             f"{trials.settings['seconds']:g} s for each row, one run. The load is a share of what "
-            "the same server does with eight callers. Goodput: the calls that were answered in "
-            "time, of what the server could do. Waste: the requests that it served for callers "
-            "that had left.\n",
+            "the same server does with eight callers. Goodput: the answers in time, of what the "
+            "server could do. Waste: the requests that it served for callers that had left. Both "
+            "count what happened while calls were offered; the number answered is that of all.\n",
             markdown_table(["goal", "outcome"], [goal.row() for goal in goals(cells)]),
             markdown_table(heading[:-1], [row(cell)[:-1] for cell in cells]),
         )

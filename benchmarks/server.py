@@ -185,9 +185,9 @@ class Server:
     def serve(self, work: dict[str, Any]) -> None:
         self._serve(Work.from_json(work))
 
-    def handled(self) -> int:
-        """How many requests the handlers that take time have finished, in all turns."""
-        return handled["requests"]
+    def handled(self, begin: float, end: float) -> int:
+        """How many requests the handlers that take time have finished between these times."""
+        return sum(begin <= at < end for at in handled)
 
     def usage(self) -> dict[str, Any]:
         return usage().to_json()

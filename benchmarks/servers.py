@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, Literal
@@ -33,7 +34,7 @@ def waiting_handler(work: Work) -> Callable[[Any, Any], Any]:
 
     async def handler(_request: Any, _response: Any) -> Any:
         await asyncio.sleep(handling_time(work))
-        handled.update(("requests",))
+        handled.append(time.monotonic())
         return prepared
 
     return handler

@@ -7,7 +7,6 @@ import dataclasses
 import importlib
 import random
 import time
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -44,8 +43,8 @@ SERVERS = {
 LIMITED = {"rosasync-one": "direct, async, one at a time"}
 """A server for the benchmark of overload alone."""
 
-handled: Counter[str] = Counter()
-"""Counts the requests that handlers with `Work.handling` of this process have finished."""
+handled: list[float] = []
+"""When handlers with `Work.handling` finished requests in this process, on the monotonic clock."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +128,7 @@ def make_handler(work: Work) -> Callable[[Any, Any], Any]:
 
     def handle(_request: Any, _response: Any) -> Any:
         time.sleep(handling_time(work))
-        handled.update(("requests",))
+        handled.append(time.monotonic())
         return prepared
 
     return handle

@@ -376,6 +376,7 @@ def overload_cell(
             "capacity": 100.0,
             "sent": round(400 * load),
             "answered": 400,
+            "within": options.get("answered", 400),
             "served": 400,
             "median": 20.0,
             "p99": 30.0,
@@ -422,6 +423,20 @@ def test_the_goals_of_overload() -> None:
     met = [goal.met for goal in overload.goals(cells)]
     assert met == [False, False, True, None, True, True, True, True]
     assert overload.row(cells[2])[7:9] == ["0.75", "0.75"]
+
+
+def test_what_comes_after_an_overload_does_not_count() -> None:
+    plan = overload.Plan("offered", "rosasync", "stock", 10.0, False, 4.0, "2")
+    ended = {"outcomes": {"answered": 3, "QueueTimeout": 1}}
+    calls = [(0.0, 0.02), (3.5, 0.1), (3.5, 1.5), (3.6, None)]
+    cell = overload.summarize(plan, 1.0, 4.0, 3, [{**ended, "calls": calls}])
+    assert (cell.sent, cell.answered, cell.within) == (4, 3, 2)
+    assert cell.goodput == 0.5
+    assert cell.waste == pytest.approx(1 / 3)
+
+    recovery = dataclasses.replace(plan, kind="recovery")
+    cell = overload.summarize(recovery, 1.0, 3.5, 3, [{**ended, "calls": calls}])
+    assert (cell.seconds, cell.sent, cell.answered) == (1.0, 3, 2)
 
 
 def test_the_arrivals_of_overload() -> None:
