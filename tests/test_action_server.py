@@ -12,6 +12,7 @@ import pytest
 from test_msgs.action import Fibonacci, NestedMessage
 
 from rosasync import GoalAborted, GoalStatus, InvalidServiceName, Session, SessionClosed, UsageError
+from rosasync._actions import server_goals
 from tests.support.action_clients import ActionClientProcess, Ended
 from tests.support.times import LIMIT, TICK, until
 
@@ -572,6 +573,35 @@ class TestEnding:
         assert steps.ended == ["cancelled"]
         assert repr(server).endswith("closed>")
         assert session.statistics().servers == ()
+
+    async def test_a_client_that_has_not_asked_yet_gets_its_end(
+        self,
+        session: Session,
+        stock: ActionClientProcess,
+        name: str,
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        monkeypatch.setattr(server_goals, "ASKING_TIME", LIMIT)
+        server = session.serve_action(Fibonacci, name, Steps())
+        assert (await stock.request(name, OTHER))[0]
+        async with asyncio.TaskGroup() as group:
+            group.create_task(server.aclose())
+            await until(lambda: server.statistics().canceled)
+            assert await stock.result(name, OTHER) == Ended(S.CANCELED, [])
+
+    async def test_a_client_that_never_asks_is_not_waited_for(
+        self,
+        session: Session,
+        stock: ActionClientProcess,
+        name: str,
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        server = session.serve_action(Fibonacci, name, Steps())
+        assert (await stock.request(name, OTHER))[0]
+        monkeypatch.setattr(server_goals, "ASKING_TIME", TICK)
+        async with asyncio.timeout(LIMIT):
+            await server.aclose()
+        assert server.closed
 
     async def test_the_session_ends_it(
         self, bridge: Any, stock: ActionClientProcess, name: str

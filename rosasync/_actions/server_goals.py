@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +30,8 @@ DELAY = 20e-6
 """Seconds by which each goal that is listed then delays the message."""
 MAX_DELAY = 0.05
 """Maximum number of seconds of this delay."""
+ASKING_TIME = 1.0
+"""Seconds after a goal's acceptance in which its client may be about to ask for the result."""
 
 
 class ServerGoals:
@@ -61,6 +65,9 @@ class ServerGoals:
         # A goal is in `_askers` until it ends, and then in `_responses` until it expires.
         self._askers: dict[bytes, list[ServiceCall[Any, Any]]] = {}
         self._responses: dict[bytes, Any] = {}
+        # The goals whose result nobody has asked for yet, and when they were accepted.
+        self._unasked: dict[bytes, float] = {}
+        self._asked = asyncio.Event()
         # Runs when the first of the goals that have ended expires.
         self._timer: asyncio.TimerHandle | None = None
         self._closed = False
@@ -92,6 +99,7 @@ class ServerGoals:
         """Add a goal that was accepted at this time, in ns of the node's clock."""
         record = self._table.accept(goal_id, stamp)
         self._askers[goal_id] = []
+        self._unasked[goal_id] = self._loop.time()
         self._show(record)
         return record
 
@@ -130,6 +138,8 @@ class ServerGoals:
         The handler of the service ``get_result``.
         """
         goal_id = call.request.goal_id.uuid.tobytes()
+        if self._unasked.pop(goal_id, None) is not None:
+            self._asked.set()
         if goal_id in self._askers:
             self._askers[goal_id].append(call)
         elif goal_id in self._responses:
@@ -143,6 +153,24 @@ class ServerGoals:
             # The result of a fresh response is an empty one.
             call.response.status = int(GoalStatus.UNKNOWN)
             self._respond(call, call.response)
+
+    async def until_asked(self) -> None:
+        """Wait for the requests for results that may be on their way, `ASKING_TIME` at most.
+
+        A client learns that its goal is accepted, and asks then. If the server ended in between, it
+        would wait for ever.
+        """
+        newest = max(self._unasked.values(), default=-math.inf)
+        recent = {
+            goal_id
+            for goal_id, accepted in self._unasked.items()
+            if accepted + ASKING_TIME > self._loop.time()
+        }
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout_at(newest + ASKING_TIME):
+                while not recent.isdisjoint(self._unasked):
+                    self._asked.clear()
+                    await self._asked.wait()
 
     def flush(self) -> None:
         """Publish the status at once, if it has changed since it was published."""
@@ -191,5 +219,6 @@ class ServerGoals:
         # The loop runs timers up to one clock resolution early.
         for record in self._table.expire(max(due, self._loop.time())):
             del self._responses[record.id]
+            self._unasked.pop(record.id, None)
             self._statuses.remove(record.id)
         self._arm()
