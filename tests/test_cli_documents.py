@@ -29,8 +29,9 @@ from rosasync._cli.documents import (
 )
 from rosasync._cli.emitter import dump_yaml
 from rosasync._cli.requests import rounds_of, template
-from rosasync._ros.fields import FieldType, field_types
+from rosasync._ros.fields import FieldType
 from rosasync._ros.interfaces import installed_types, parts
+from rosasync._ros.message_fields import field_types
 
 PACKAGES = {
     "diagnostic_msgs",

@@ -20,7 +20,8 @@ from typing import Any
 
 from rosasync._cli.emitter import UNREADABLE
 from rosasync._core.safe_yaml import STRING_TAG, Event, YamlError, at, build
-from rosasync._ros.fields import FieldType, field_types
+from rosasync._ros.fields import FieldType
+from rosasync._ros.message_fields import field_types
 from rosasync._ros.messages import to_dict, to_message
 from rosasync._ros.types import Unquoted, type_name
 

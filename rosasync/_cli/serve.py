@@ -24,7 +24,7 @@ from rosasync._cli.output import note, print_value
 from rosasync._cli.requests import message_from
 from rosasync._cli.run import open_session, run
 from rosasync._cli.streams import OutputError
-from rosasync._ros.fields import field_types
+from rosasync._ros.message_fields import field_types
 from rosasync._status.wire import Outcome
 
 __all__ = ["load_handler", "serve"]

@@ -6,9 +6,9 @@ field as False, the bits of an int as those of a float, 300 in a uint8 as 44, an
 end of a fixed array that is too short. So every message is checked before it is sent.
 
 The function for a type is a single expression, which reads the slots of the message directly: that
-is six times as fast as the loop of `rosasync._ros.fields.fit` for a message of one field, and more
-for others. It may say no to a message that rclpy would send correctly, but never yes to another:
-`fit` decides then, field by field.
+is six times as fast as the loop of `rosasync._ros.message_fields.fit` for a message of one field,
+and more for others. It may say no to a message that rclpy would send correctly, but never yes to
+another: `fit` decides then, field by field.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import array
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from rosasync._ros import fields
+from rosasync._ros import fields, message_fields, sequence_fields
 from rosasync._ros.types import type_name
 
 __all__ = ["checker"]
@@ -69,7 +69,7 @@ class _Source:
         variable = self.variable()
         assigned = f"{variable} := {value}"
         match field:
-            case fields.MessageField():
+            case message_fields.MessageField():
                 return self.message(f"({assigned})", field.message_type)
             case fields.BoolField():
                 return f"(({assigned}) is True or {variable} is False)"
@@ -84,7 +84,7 @@ class _Source:
                 return f"(isinstance({assigned}, float) and ({finite} or {infinite}))"
             case fields.StringField():
                 return self.text(assigned, variable, field)
-            case fields.SequenceField():
+            case sequence_fields.SequenceField():
                 return self.sequence(assigned, variable, field)
         return f"{self.constant(_fits(field))}({value})"
 
@@ -97,8 +97,8 @@ class _Source:
         other = f"{self.constant(_fits(field))}({variable})"
         return f"(isinstance({assigned}, str) and ({' and '.join(tests)} or {other}))"
 
-    def sequence(self, assigned: str, variable: str, field: fields.SequenceField) -> str:
-        if isinstance(field, fields.NumbersField):
+    def sequence(self, assigned: str, variable: str, field: sequence_fields.SequenceField) -> str:
+        if isinstance(field, sequence_fields.NumbersField):
             return self.numbers(assigned, variable, field)
         kinds = [f"type({assigned}) is list", f"type({variable}) is tuple"]
         tests = [f"({' or '.join(kinds)})"]
@@ -108,13 +108,13 @@ class _Source:
             tests.append(f"len({variable}) <= {field.most}")
         tests.append(f"(not {variable} or {self.elements(field.element)}({variable}))")
         test = f"({' and '.join(tests)})"
-        if isinstance(field, fields.OctetsField) and not field.least:
+        if isinstance(field, sequence_fields.OctetsField) and not field.least:
             # rclpy copies bytes as they are.
             bound = "" if field.most is None else f" and len({variable}) <= {field.most}"
             test = f"({test} or type({variable}) is bytes{bound})"
         return test
 
-    def numbers(self, assigned: str, variable: str, field: fields.NumbersField) -> str:
+    def numbers(self, assigned: str, variable: str, field: sequence_fields.NumbersField) -> str:
         """Return a test that takes the same time for any number of elements."""
         if field.least:
             kind = self.constant(type(field.default))
@@ -135,7 +135,7 @@ class _Source:
                 return self.constant(_are_octets)
             case fields.StringField(bound=None, wide=False):
                 return self.constant(_are_texts)
-            case fields.MessageField():
+            case message_fields.MessageField():
                 name = self.variable()
                 test = self.message("item", element.message_type)
                 code = (
@@ -167,7 +167,7 @@ def _slots(message_type: type[Any]) -> list[tuple[str, fields.Field]]:
     return [
         # Read directly, because a property is a Python function.
         (f"_{name}" if f"_{name}" in slots else name, field)
-        for name, field in fields.fields_of(message_type).items()
+        for name, field in message_fields.fields_of(message_type).items()
     ]
 
 

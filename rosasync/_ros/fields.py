@@ -1,5 +1,8 @@
 """The fields of messages: how the values of each ROS type are checked and converted.
 
+The types with one value are here, those with several in `rosasync._ros.sequence_fields`, and nested
+messages in `rosasync._ros.message_fields`, which has the fields of each message class.
+
 A value comes from one of two places, and what is taken from each differs a little:
 
 - From a mapping (`Field.to_ros`): YAML, JSON, or a dict. It has to be of the field's kind.
@@ -9,12 +12,6 @@ A value comes from one of two places, and what is taken from each differs a litt
 
 from __future__ import annotations
 
-import array
-import base64
-import binascii
-import copy
-import difflib
-import importlib
 import math
 import numbers
 import operator
@@ -22,34 +19,24 @@ import reprlib
 import struct
 import sys
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Any, Literal
 
-from rosasync._ros.types import hint, shown, type_name
+from rosasync._ros.types import shown
 
 __all__ = [
+    "BASIC",
+    "UINT8",
     "BoolField",
     "ByteField",
-    "BytesField",
     "CharField",
     "Field",
     "FieldType",
     "FloatField",
     "IntegerField",
     "InvalidField",
-    "MessageField",
-    "NumbersField",
-    "OctetsField",
-    "SequenceField",
     "StringField",
-    "build",
-    "field_types",
-    "fields_of",
-    "fit",
-    "json_fields",
-    "plain_fields",
+    "UncheckedField",
 ]
 
 _NOT_FINITE = frozenset({"NaN", "Infinity", "-Infinity"})
@@ -70,23 +57,6 @@ class FieldType:
     kind: Literal["bool", "int", "float", "byte", "string", "message", "sequence"]
     message_type: type[Any] | None = None
     element: FieldType | None = None
-
-
-_described: dict[type[Any], Mapping[str, FieldType]] = {}
-
-
-def field_types(message_type: type[Any]) -> Mapping[str, FieldType]:
-    """Return the type of each field of a message class, by name.
-
-    Raises:
-        TypeError: not a message class.
-    """
-    known = fields_of(message_type)
-    found = _described.get(message_type)
-    if found is None:
-        found = MappingProxyType({name: field.describe() for name, field in known.items()})
-        _described[message_type] = found
-    return found
 
 
 class InvalidField(Exception):
@@ -250,7 +220,7 @@ class ByteField(Field):
             raise InvalidField(ValueError, f"expected 1 byte, got {len(value)}")
         if not isinstance(value, numbers.Integral) or isinstance(value, bool):
             raise self.refuse(value)
-        return bytes((_UINT8.to_ros(value),))
+        return bytes((UINT8.to_ros(value),))
 
     def to_json(self, value: Any) -> int:
         return int(value[0])
@@ -302,219 +272,6 @@ class StringField(Field):
             ) from None
 
 
-class MessageField(Field):
-    """A nested message."""
-
-    def __init__(self, message_type: type[Any]) -> None:
-        super().__init__(type_name(message_type))
-        self.message_type = message_type
-
-    def to_ros(self, value: object) -> Any:
-        if isinstance(value, self.message_type):
-            return fit(self.message_type, value)
-        if isinstance(value, Mapping):
-            return build(self.message_type, value)
-        raise self.refuse(value)
-
-    def refuse(self, value: object) -> InvalidField:
-        refused = super().refuse(value)
-        if hasattr(value, "to_msg") and not isinstance(value, type):
-            refused.problem += ": pass its to_msg()"
-        return refused
-
-    def to_plain(self, value: Any) -> dict[str, Any]:
-        return plain_fields(value)
-
-    def to_json(self, value: Any) -> dict[str, Any]:
-        return json_fields(value)
-
-    def describe(self) -> FieldType:
-        return FieldType(self.label, "message", message_type=self.message_type)
-
-
-class SequenceField(Field):
-    """An array, of which ``least`` equals ``most``, or a sequence, bounded or not."""
-
-    def __init__(self, element: Field, least: int, most: int | None) -> None:
-        size = "" if most is None else f"{most}" if least else f"<={most}"
-        super().__init__(f"{element.label}[{size}]")
-        self.element = element
-        self.least = least
-        self.most = most
-
-    def to_ros(self, value: object) -> Any:
-        items = self.items(value)
-        self.check_size(len(items))
-        convert = self.element.to_ros
-        converted: list[Any] = []
-        try:
-            for item in items:
-                converted.append(convert(item))
-        except InvalidField as invalid:
-            raise invalid.at(f"[{len(converted)}]") from None
-        return converted
-
-    def fit(self, value: Any) -> Any:
-        if not isinstance(value, list | tuple):
-            return self.to_ros(value)
-        self.check_size(len(value))
-        fitted: list[Any] = []
-        try:
-            for item in value:
-                fitted.append(self.element.fit(item))
-        except InvalidField as invalid:
-            raise invalid.at(f"[{len(fitted)}]") from None
-        return value if all(map(operator.is_, value, fitted)) else fitted
-
-    def to_plain(self, value: Any) -> Any:
-        return [self.element.to_plain(item) for item in value]
-
-    def to_json(self, value: Any) -> Any:
-        return [self.element.to_json(item) for item in value]
-
-    def describe(self) -> FieldType:
-        return FieldType(self.label, "sequence", element=self.element.describe())
-
-    def items(self, value: object) -> Sequence[Any]:
-        """Return the elements of a value."""
-        if isinstance(value, Sequence) and not isinstance(value, str | bytes | bytearray):
-            return value
-        if getattr(value, "ndim", 1) > 1:
-            shape = getattr(value, "shape", None)
-            raise InvalidField(
-                TypeError, f"expected {self.label}, got an array of shape {shape}: flatten it"
-            )
-        to_list = getattr(value, "tolist", None)  # of NumPy arrays and memory views
-        items = to_list() if to_list is not None else None
-        if not isinstance(items, list):
-            raise self.refuse(value)
-        return items
-
-    def decode(self, text: str) -> bytes:
-        """Return the bytes that JSON has as base64."""
-        try:
-            return base64.b64decode(text, validate=True)
-        except (binascii.Error, ValueError):  # ValueError: not ASCII
-            refused = self.refuse(text)
-            refused.problem += ", which is not base64"
-            raise refused from None
-
-    def check_size(self, size: int) -> None:
-        """Raise unless this many elements fit."""
-        if size < self.least:
-            raise InvalidField(ValueError, f"expected {self.least} elements, got {size}")
-        if self.most is not None and size > self.most:
-            wanted = f"{self.most}" if self.least else f"at most {self.most}"
-            raise InvalidField(ValueError, f"expected {wanted} elements, got {size}")
-
-
-class NumbersField(SequenceField):
-    """Numbers, in rclpy an ``array.array``, or a NumPy array if the size is fixed."""
-
-    def __init__(
-        self, element: IntegerField | FloatField, least: int, most: int | None, default: Any
-    ) -> None:
-        super().__init__(element, least, most)
-        self.typecode = element.typecode
-        self.default = default
-        self.formats = _formats_like(element.typecode)
-
-    def to_ros(self, value: object) -> Any:
-        packed = _buffer(value, self.formats)
-        if packed is None:
-            return super().to_ros(value)
-        self.check_size(len(packed))
-        copied = array.array(self.typecode)
-        copied.frombytes(packed.tobytes())
-        return copied
-
-    def fit(self, value: Any) -> Any:
-        packed = _buffer(value, self.formats) if isinstance(value, type(self.default)) else None
-        if packed is None:
-            return self.to_ros(value)
-        self.check_size(len(packed))
-        return value
-
-    def to_plain(self, value: Any) -> Any:
-        return array.array(self.typecode, value).tolist()
-
-    def to_json(self, value: Any) -> Any:
-        plain = self.to_plain(value)
-        if self.typecode in "fd" and not all(map(math.isfinite, plain)):
-            return [self.element.to_json(item) for item in plain]
-        return plain
-
-
-class BytesField(NumbersField):
-    """Numbers of type uint8."""
-
-    def to_ros(self, value: object) -> Any:
-        return super().to_ros(self.decode(value) if isinstance(value, str) else value)
-
-    def to_plain(self, value: Any) -> bytes:
-        return bytes(value)
-
-    def to_json(self, value: Any) -> str:
-        return _base64(self.to_plain(value))
-
-
-class OctetsField(SequenceField):
-    """Bytes, which rclpy represents as a list of bytes of length 1."""
-
-    def to_ros(self, value: object) -> Any:
-        if isinstance(value, str):
-            value = self.decode(value)
-        packed = _buffer(value, ("B",))
-        if packed is None:
-            return super().to_ros(value)
-        self.check_size(len(packed))
-        return [bytes((number,)) for number in packed]
-
-    def fit(self, value: Any) -> Any:
-        if isinstance(value, bytes | bytearray) and not self.least:
-            self.check_size(len(value))
-            return value
-        if isinstance(value, str):
-            raise self.refuse(value)
-        return super().fit(value)
-
-    def to_plain(self, value: Any) -> bytes:
-        return bytes(value) if isinstance(value, bytes | bytearray) else b"".join(value)
-
-    def to_json(self, value: Any) -> str:
-        return _base64(self.to_plain(value))
-
-
-def _base64(value: bytes) -> str:
-    return base64.b64encode(value).decode()
-
-
-def _name_of(value: float) -> str:
-    """Return the text by which JSON has a number that it cannot write."""
-    return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
-
-
-def _formats_like(typecode: str) -> tuple[str, ...]:
-    """Return the codes of the same kind and size, such as a C long for an int64."""
-    size = struct.calcsize(typecode)
-    kind = next(codes for codes in ("bhilq", "BHILQ", "fd") if typecode in codes)
-    return tuple(code for code in kind if struct.calcsize(code) == size)
-
-
-def _buffer(value: Any, formats: tuple[str, ...]) -> memoryview | None:
-    """Return a view of the value if its layout fits, so that no element needs a check; or None."""
-    try:
-        view = memoryview(value)
-    except (TypeError, ValueError):  # ValueError: a NumPy array of dates, a released view
-        return None
-    return view if view.ndim == 1 and view.format in formats else None
-
-
-def _is_numpy_bool(value: Any) -> bool:
-    numpy = sys.modules.get("numpy")
-    return numpy is not None and isinstance(value, numpy.bool_)
-
-
 class UncheckedField(Field):
     """A type of IDL that no message of ROS has, and for which rclpy has no agreed value."""
 
@@ -522,15 +279,25 @@ class UncheckedField(Field):
         return value
 
 
-_UINT8 = IntegerField("uint8", "B")
-_BASIC: dict[str, Field] = {
+def _name_of(value: float) -> str:
+    """Return the text by which JSON has a number that it cannot write."""
+    return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
+
+
+def _is_numpy_bool(value: Any) -> bool:
+    numpy = sys.modules.get("numpy")
+    return numpy is not None and isinstance(value, numpy.bool_)
+
+
+UINT8 = IntegerField("uint8", "B")
+BASIC: dict[str, Field] = {
     "boolean": BoolField("bool"),
     "octet": ByteField("byte"),
     "char": CharField("char"),
     "float": FloatField("float32", "f", (2 - 2**-23) * 2.0**127),
     "double": FloatField("float64", "d", sys.float_info.max),
     "int8": IntegerField("int8", "b"),
-    "uint8": _UINT8,
+    "uint8": UINT8,
     "int16": IntegerField("int16", "h"),
     "uint16": IntegerField("uint16", "H"),
     "int32": IntegerField("int32", "i"),
@@ -538,118 +305,4 @@ _BASIC: dict[str, Field] = {
     "int64": IntegerField("int64", "q"),
     "uint64": IntegerField("uint64", "Q"),
 }
-
-
-def build(message_type: type[Any], values: Mapping[Any, Any]) -> Any:
-    """Create a message from a mapping of its fields, or raise `InvalidField`."""
-    fields = fields_of(message_type)
-    message = message_type()
-    for name, value in values.items():
-        field = fields.get(name)
-        if field is None:
-            raise _no_such_field(message_type, name)
-        try:
-            converted = field.to_ros(value)
-        except InvalidField as invalid:
-            raise invalid.at(f".{name}") from None
-        setattr(message, name, converted)
-    return message
-
-
-def fit(message_type: type[Any], message: Any) -> Any:
-    """Return a message that rclpy sends as what it holds, or raise `InvalidField`.
-
-    It is the message itself, or a copy if a value had to be converted.
-    """
-    converted = {}
-    for name, field in fields_of(message_type).items():
-        value = getattr(message, name)
-        try:
-            fitted = field.fit(value)
-        except InvalidField as invalid:
-            raise invalid.at(f".{name}") from None
-        if fitted is not value:
-            converted[name] = fitted
-    if not converted:
-        return message
-    copied = copy.copy(message)
-    for name, fitted in converted.items():
-        setattr(copied, name, fitted)
-    return copied
-
-
-def plain_fields(message: Any) -> dict[str, Any]:
-    """Return the fields of a message as plain values."""
-    fields = fields_of(type(message))
-    return {name: field.to_plain(getattr(message, name)) for name, field in fields.items()}
-
-
-def json_fields(message: Any) -> dict[str, Any]:
-    """Return the fields of a message as values of JSON."""
-    fields = fields_of(type(message))
-    return {name: field.to_json(getattr(message, name)) for name, field in fields.items()}
-
-
-def _no_such_field(message_type: type[Any], name: object) -> InvalidField:
-    fields = fields_of(message_type)
-    similar = hint(difflib.get_close_matches(str(name), fields, n=1), fields)
-    problem = f"no such field in {type_name(message_type)}{similar}"
-    return InvalidField(ValueError, problem).at(f".{name}")
-
-
-_known: dict[type[Any], dict[str, Field]] = {}
-
-
-def fields_of(message_type: type[Any]) -> dict[str, Field]:
-    """Return the fields of a message class by name.
-
-    Raises:
-        TypeError: not a message class.
-    """
-    if not isinstance(message_type, type):
-        raise TypeError(f"{shown(message_type)} is not a message type")
-    fields = _known.get(message_type)
-    if fields is None:
-        if not hasattr(message_type, "SLOT_TYPES"):
-            raise TypeError(f"{shown(message_type)} is not a message type")
-        # A subclass of the user may need arguments to be created.
-        generated: Any = next(base for base in message_type.__mro__ if "SLOT_TYPES" in vars(base))
-        names = generated.get_fields_and_field_types()
-        types = dict(zip(names, generated.SLOT_TYPES, strict=True))
-        blank = generated()
-        fields = {name: _field(slot, getattr(blank, name)) for name, slot in types.items()}
-        _known[message_type] = fields
-    return fields
-
-
-def _field(slot: Any, default: object = None) -> Field:
-    """Return the field for a rosidl_parser type; ``default`` is its value in a new message."""
-    idl: Any = importlib.import_module("rosidl_parser.definition")
-    if isinstance(slot, idl.AbstractNestedType):
-        return _sequence(slot, _field(slot.value_type), default)
-    if isinstance(slot, idl.NamespacedType):
-        # Not imported if there is a default, because an action goal is not in the module it names.
-        return MessageField(type(default) if default is not None else _imported(slot))
-    if isinstance(slot, idl.AbstractGenericString):
-        bound = slot.maximum_size if slot.has_maximum_size() else None
-        return StringField(bound, wide=isinstance(slot, idl.AbstractWString))
-    return _BASIC.get(slot.typename) or UncheckedField(slot.typename)
-
-
-def _imported(slot: Any) -> type[Any]:
-    module = importlib.import_module(".".join(slot.namespaces))
-    found: type[Any] = getattr(module, slot.name)
-    return found
-
-
-def _sequence(slot: Any, element: Field, default: Any) -> SequenceField:
-    size: int | None = getattr(slot, "size", None)  # of an array
-    least = size or 0
-    most = size or getattr(slot, "maximum_size", None)
-    if element is _UINT8:
-        return BytesField(_UINT8, least, most, default)
-    if isinstance(element, ByteField):
-        return OctetsField(element, least, most)
-    if isinstance(element, IntegerField | FloatField):
-        return NumbersField(element, least, most, default)
-    return SequenceField(element, least, most)
+"""The fields that are neither messages nor strings nor sequences, by the name of the IDL type."""

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rosasync._ros.fields import FieldType, field_types
+from rosasync._ros.fields import FieldType
+from rosasync._ros.message_fields import field_types
 from rosasync._ros.middleware import prefixes
 from rosasync._ros.types import type_name
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from rosasync._ros import fields, interfaces
+from rosasync._ros import fields, interfaces, message_fields, sequence_fields
 from rosasync._ros.types import type_name
 
 __all__ = ["json_schema"]
@@ -40,7 +40,7 @@ def json_schema(message_type: type[Any]) -> dict[str, Any]:
 def _message(message_type: type[Any], nested: dict[str, dict[str, Any]]) -> dict[str, Any]:
     """Describe a message class, and add the types of its fields to ``nested``."""
     properties = {}
-    known = fields.fields_of(message_type)
+    known = message_fields.fields_of(message_type)
     blank = message_type()
     comments = {field.name: field.comment for field in interfaces.fields(message_type)}
     for name, field in known.items():
@@ -60,7 +60,7 @@ def _message(message_type: type[Any], nested: dict[str, dict[str, Any]]) -> dict
 
 def _field(field: fields.Field, nested: dict[str, dict[str, Any]]) -> dict[str, Any]:
     match field:
-        case fields.MessageField():
+        case message_fields.MessageField():
             return _reference(field.message_type, nested)
         case fields.BoolField():
             return {"type": "boolean"}
@@ -75,10 +75,10 @@ def _field(field: fields.Field, nested: dict[str, dict[str, Any]]) -> dict[str, 
             return {"type": "string", "minLength": 1, "maxLength": 1}
         case fields.StringField(bound=bound):
             return {"type": "string"} | ({} if bound is None else {"maxLength": bound})
-        case fields.BytesField() | fields.OctetsField():
+        case sequence_fields.BytesField() | sequence_fields.OctetsField():
             size = {"type": "string", "contentEncoding": "base64"}
             return size | _sizes("Length", _encoded(field.least), _encoded(field.most))
-        case fields.SequenceField():
+        case sequence_fields.SequenceField():
             items = {"type": "array", "items": _field(field.element, nested)}
             return items | _sizes("Items", field.least, field.most)
     return {}

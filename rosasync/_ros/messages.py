@@ -9,7 +9,8 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from rosasync._ros.checks import checker
-from rosasync._ros.fields import InvalidField, build, fit, json_fields, plain_fields
+from rosasync._ros.fields import InvalidField
+from rosasync._ros.message_fields import build, fit, json_fields, plain_fields
 from rosasync._ros.types import shown, type_name
 
 __all__ = ["make_message", "to_dict", "to_message"]

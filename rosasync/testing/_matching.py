@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pprint import pformat
 from typing import Any
 
-from rosasync._ros.fields import field_types
+from rosasync._ros.message_fields import field_types
 from rosasync._ros.types import type_name
 
 __all__ = ["check_fields", "count", "describe", "difference", "explain_mismatch", "matches"]
