@@ -21,6 +21,8 @@ from rosasync._actions import client as action_client
 from tests.support.action_servers import ActionServerProcess
 from tests.support.times import LIMIT, TICK, until
 
+pytestmark = pytest.mark.slow
+
 if TYPE_CHECKING:
     from tests.conftest import Bridge
 

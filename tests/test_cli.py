@@ -81,6 +81,7 @@ def test_demo_prints_json_alone() -> None:
         assert contest["ratio"]["median"] == pytest.approx(ours["median_us"] / stock["median_us"])
 
 
+@pytest.mark.slow
 @as_root
 def test_demo_works_although_the_middleware_logs_errors() -> None:
     command = (*ROSASYNC, "demo", "--json", "--calls", "20", "--seconds", "60")
@@ -89,6 +90,7 @@ def test_demo_works_although_the_middleware_logs_errors() -> None:
     assert len(json.loads(done.stdout)["contests"]) == 2
 
 
+@pytest.mark.slow
 def test_demo_shows_table_and_histogram_where_stdout_knows_no_unicode() -> None:
     done = run(*ROSASYNC, "demo", "--calls", "20", "--seconds", "60", PYTHONIOENCODING="ascii")
     assert done.returncode == 0, done.stderr
@@ -96,6 +98,7 @@ def test_demo_shows_table_and_histogram_where_stdout_knows_no_unicode() -> None:
         assert text in done.stdout
 
 
+@pytest.mark.slow
 def test_demo_stops_measuring_when_its_seconds_are_over() -> None:
     done = run(*ROSASYNC, "demo", "--json", "--calls", "1000000", "--seconds", "0.5")
     assert done.returncode == 0, done.stderr

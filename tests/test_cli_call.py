@@ -33,16 +33,19 @@ def test_infers_the_type_and_prints_json() -> None:
     assert json_lines(done.stdout) == [{"success": True, "message": "True"}]
 
 
+@pytest.mark.slow
 def test_without_a_request_it_sends_the_defaults() -> None:
     done = rosasync("call", LAMP, "--field", "message")
     assert (done.returncode, done.stdout) == (0, "False\n")
 
 
+@pytest.mark.slow
 def test_a_plain_text_is_sent_as_it_is_written() -> None:
     done = rosasync("call", TEXT, TEXT_TYPE, "load_namespace: on", "--field", "message")
     assert (done.returncode, done.stdout) == (0, "on\n")
 
 
+@pytest.mark.slow
 def test_several_documents_of_a_file_and_of_standard_input(tmp_path: Path) -> None:
     file = tmp_path / "requests.yaml"
     file.write_text("data: true\n---\ndata: false\n")
@@ -55,6 +58,7 @@ def test_several_documents_of_a_file_and_of_standard_input(tmp_path: Path) -> No
     assert "2 answered, 0 failed" in done.stderr
 
 
+@pytest.mark.slow
 def test_answers_each_document_before_the_input_ends() -> None:
     command = (sys.executable, "-m", "rosasync", "call", LAMP, LAMP_TYPE, "-", "--json")
     with ended(
@@ -73,6 +77,7 @@ def test_answers_each_document_before_the_input_ends() -> None:
     assert summary["summary"]["answered"] == 1
 
 
+@pytest.mark.slow
 def test_count_concurrency_and_rate_end_with_a_summary() -> None:
     done = rosasync("call", LAMP, ON, "--count", "30", "--concurrency", "5", "--rate", "1000")
     assert (done.returncode, done.stderr) == (0, "")
@@ -81,6 +86,7 @@ def test_count_concurrency_and_rate_end_with_a_summary() -> None:
     assert "p99" in done.stdout
 
 
+@pytest.mark.slow
 def test_json_of_several_calls_has_a_line_each_and_a_summary() -> None:
     done = rosasync("call", LAMP, ON, "--count", "3", "--json")
     *responses, summary = json_lines(done.stdout)
@@ -89,6 +95,7 @@ def test_json_of_several_calls_has_a_line_each_and_a_summary() -> None:
     assert summary["summary"]["failed"] == {}
 
 
+@pytest.mark.slow
 def test_template_is_a_request_to_edit_and_send() -> None:
     done = rosasync("call", LAMP, "--template")
     assert done.returncode == 0
@@ -99,6 +106,7 @@ def test_template_is_a_request_to_edit_and_send() -> None:
     assert (sent.returncode, sent.stdout) == (0, "True\n")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "code", "says"),
     [
@@ -126,6 +134,7 @@ def test_a_failure_has_an_exit_code_and_one_line(
     assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_another_type_is_a_warning_before_it_is_an_error() -> None:
     done = rosasync("call", LAMP, "std_srvs/srv/Trigger", "--timeout", "4")
     assert done.returncode == 3
@@ -134,6 +143,7 @@ def test_another_type_is_a_warning_before_it_is_an_error() -> None:
     assert f"this name is served as {LAMP_TYPE}" in error
 
 
+@pytest.mark.slow
 def test_failures_of_several_calls_are_counted_by_kind() -> None:
     done = rosasync("call", "/lamp/silent", LAMP_TYPE, "--count", "2", "--timeout", "3", "--json")
     assert done.returncode == 4
@@ -142,6 +152,7 @@ def test_failures_of_several_calls_are_counted_by_kind() -> None:
     assert summary["summary"]["failed"] == {"ResponseTimeout": 2}
 
 
+@pytest.mark.slow
 def test_the_server_goes_away() -> None:
     with ServerProcess() as server:
         server.serve_now("/leaving", LAMP_TYPE, delay="never")
@@ -152,6 +163,7 @@ def test_the_server_goes_away() -> None:
     assert "Call again" in command.screen.replace("\n", " ")
 
 
+@pytest.mark.slow
 def test_ctrl_c_while_it_waits(lamp: ServerProcess) -> None:
     received = len(lamp.ask_now("received", name="/lamp/silent", at_least=0))
     with terminal("call", "/lamp/silent", LAMP_TYPE, "--timeout", "60") as command:
@@ -162,6 +174,7 @@ def test_ctrl_c_while_it_waits(lamp: ServerProcess) -> None:
     assert "Traceback" not in command.screen
 
 
+@pytest.mark.slow
 def test_ctrl_c_shows_the_summary_of_what_ran() -> None:
     with terminal("call", LAMP, ON, "--count", "1000000", "--rate", "200") as command:
         command.wait_for(r"[1-9]\d* of 1000000 calls made")
@@ -171,6 +184,7 @@ def test_ctrl_c_shows_the_summary_of_what_ran() -> None:
     assert "Traceback" not in command.screen
 
 
+@pytest.mark.slow
 def test_progress_is_drawn_on_a_terminal_only() -> None:
     with terminal("call", LAMP, ON, "--count", "3") as command:
         assert command.end() == 0
@@ -179,6 +193,7 @@ def test_progress_is_drawn_on_a_terminal_only() -> None:
     assert "\x1b" not in rosasync("call", LAMP, ON, "--count", "3").stderr
 
 
+@pytest.mark.slow
 def test_responses_go_to_the_file_while_progress_is_on_the_terminal(tmp_path: Path) -> None:
     file = tmp_path / "responses"
     with terminal("call", LAMP, ON, "--count", "3", "--json", into=f"> {file}") as command:
@@ -188,6 +203,7 @@ def test_responses_go_to_the_file_while_progress_is_on_the_terminal(tmp_path: Pa
     assert command.screen == ""
 
 
+@pytest.mark.slow
 def test_a_closed_pipe_ends_it_quietly() -> None:
     command = f"{sys.executable} -m rosasync call {LAMP} --count 100000 --rate 500 --json | head -1"
     done = subprocess.run(
@@ -209,6 +225,7 @@ BOMB = "\n".join(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stdin", "message"),
     [

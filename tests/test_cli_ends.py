@@ -18,6 +18,8 @@ from tests.support.introspected import IntrospectedProcess
 from tests.support.process import ROOT, ended
 from tests.support.times import LIMIT, until
 
+pytestmark = pytest.mark.slow
+
 
 @contextmanager
 def started(*arguments: str, prefix: tuple[str, ...] = ()) -> Iterator[subprocess.Popen[str]]:

@@ -114,6 +114,7 @@ def complete(line: str, **environ: str) -> list[str]:
     return done.stdout.split()
 
 
+@pytest.mark.slow
 def test_completes_commands_and_types() -> None:
     assert complete("rosasync wa") == ["watch"]
     assert LAMP_TYPE in complete("rosasync find std_srvs/")

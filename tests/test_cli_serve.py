@@ -28,6 +28,7 @@ async def test_serve_echoes_to_a_stock_client(client_process: ClientProcess) -> 
     assert "Traceback" not in server.screen
 
 
+@pytest.mark.slow
 def test_serve_answers_with_a_response_after_a_delay() -> None:
     options = ("--response", "{success: true, message: hello}", "--delay", "0.01", "--json")
     with terminal("serve", "/stub/hello", LAMP_TYPE, *options) as server:
@@ -38,6 +39,7 @@ def test_serve_answers_with_a_response_after_a_delay() -> None:
         assert server.end() == 130
 
 
+@pytest.mark.slow
 def test_serve_fails_and_drops() -> None:
     with (
         terminal("serve", "/stub/fails", LAMP_TYPE, "--echo", "--fail-rate", "1") as failing,
@@ -53,6 +55,7 @@ def test_serve_fails_and_drops() -> None:
     assert "responses: 0" in dropping.screen
 
 
+@pytest.mark.slow
 def test_serve_ends_while_it_delays_a_response() -> None:
     with terminal("serve", "/stub/late", LAMP_TYPE, "--delay", "100") as server:
         server.wait_for("Ctrl-C ends it")
@@ -75,6 +78,7 @@ async def one(call):
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("function", ["pair", "one"])
 def test_serve_with_a_handler(function: str, tmp_path: Path) -> None:
     (tmp_path / "handlers.py").write_text(HANDLERS)
@@ -87,6 +91,7 @@ def test_serve_with_a_handler(function: str, tmp_path: Path) -> None:
         assert server.end() == 130
 
 
+@pytest.mark.slow
 def test_serve_reports_what_a_handler_raises(tmp_path: Path) -> None:
     (tmp_path / "failing.py").write_text("def fail(call):\n    raise LookupError('no lamp')\n")
     path = {"PYTHONPATH": f"{Path.cwd()}:{tmp_path}"}
@@ -101,6 +106,7 @@ def test_serve_reports_what_a_handler_raises(tmp_path: Path) -> None:
     assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_serve_reports_that_it_closes() -> None:
     options = ("--status", "--delay", "1000")
     with terminal("serve", "/stub/closing", LAMP_TYPE, *options) as server:
@@ -113,6 +119,7 @@ def test_serve_reports_that_it_closes() -> None:
     assert "the server closed before it answered" in " ".join(call.screen.split())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "says"),
     [
@@ -130,6 +137,7 @@ def test_serve_refuses(options: tuple[str, ...], says: str) -> None:
     assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_demo_serves_the_tutorials_lamp(lamp: ServerProcess) -> None:
     with terminal("demo", "--serve") as server:
         server.wait_for("serving /lamp/switch")
@@ -150,6 +158,7 @@ def test_bench_in_a_pipe(lamp: ServerProcess) -> None:
     assert 0 < figures["p50_ms"] <= figures["p99_ms"] <= figures["max_ms"]
 
 
+@pytest.mark.slow
 def test_bench_counts_losses(lamp: ServerProcess) -> None:
     options = ("--duration", "0.1", "--timeout", "3", "--callers", "1", "--json")
     done = rosasync("bench", "/lamp/silent", LAMP_TYPE, *options)
@@ -159,6 +168,7 @@ def test_bench_counts_losses(lamp: ServerProcess) -> None:
     assert figures["failed"] == {"ResponseTimeout": 1}
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_a_bench_with_its_summary(lamp: ServerProcess) -> None:
     with terminal("bench", LAMP, "--duration", "1000", "--rate", "500") as command:
         command.wait_for(r"[1-9]\d* answered, 0 failed")
@@ -174,6 +184,7 @@ def watched() -> Iterator[IntrospectedProcess]:
         yield process
 
 
+@pytest.mark.slow
 def test_watch_switches_introspection_on_and_off_again(watched: IntrospectedProcess) -> None:
     with terminal("watch", WATCHED) as command:
         command.wait_for("set to 'contents'")
@@ -200,6 +211,7 @@ def test_watch_prints_json(watched: IntrospectedProcess) -> None:
     assert received["sequence"] == sent["sequence"]
 
 
+@pytest.mark.slow
 def test_watch_says_how_to_switch_introspection_on(lamp: ServerProcess) -> None:
     with terminal("watch", LAMP) as command:
         command.wait_for("configure_introspection")

@@ -334,6 +334,7 @@ asyncio.run(main())
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("environ", "arguments", "expected"),
     [

@@ -87,20 +87,24 @@ async def run_client(
 
 
 class TestSession:
+    @pytest.mark.slow
     async def test_a_session_uses_it(self, hosts: LossyHosts, tmp_path: Path) -> None:
         log = await run_client(hosts, "session", tmp_path, {}, often=True)
         assert "profile" not in log
 
+    @pytest.mark.slow
     async def test_after_a_stock_node(self, hosts: LossyHosts, tmp_path: Path) -> None:
         """Fast DDS reads profile files before the first participant of a process only."""
         log = await run_client(hosts, "late session", tmp_path, {}, often=True)
         assert "profile" not in log
 
+    @pytest.mark.slow
     async def test_switched_off(self, hosts: LossyHosts, tmp_path: Path) -> None:
         off = {profile.SWITCH: "off"}
         log = await run_client(hosts, "session", tmp_path, off, often=False)
         assert "profile" not in log
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         ("text", "missing"),
         [(OTHERS, "'client' and 'service'"), (ONLY_CLIENT, "'service'")],
@@ -115,6 +119,7 @@ class TestSession:
         log = await run_client(hosts, "session", tmp_path, given, often=often)
         assert f"sets no heartbeat period for the publishers {missing}, so" in log
 
+    @pytest.mark.slow
     async def test_the_users_file_in_the_working_directory(
         self, hosts: LossyHosts, tmp_path: Path
     ) -> None:

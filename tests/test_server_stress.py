@@ -20,6 +20,8 @@ from tests.support.echo import ECHO
 from tests.support.serving import FORMS, AnyCall, ask, echo_of, serving, settled
 from tests.support.times import LIMIT, TICK, until
 
+pytestmark = pytest.mark.slow
+
 numbers = itertools.count()
 
 CLIENTS = 50

@@ -17,6 +17,8 @@ from tests.support.servers import ServerProcess
 from tests.support.serving import FORMS
 from tests.support.times import LIMIT, TICK
 
+pytestmark = pytest.mark.slow
+
 SHAPES = {
     "shared": Limits(grace=4 * TICK),
     "exclusive": Limits(clients=8, in_flight=1, grace=4 * TICK),

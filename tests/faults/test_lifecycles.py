@@ -22,6 +22,8 @@ from tests.support.servers import ServerProcess
 from tests.support.serving import FORMS
 from tests.support.times import LIMIT, TICK, until
 
+pytestmark = pytest.mark.slow
+
 
 async def test_closed_under_calls(trial: Trial, server: ServerProcess, full: bool) -> None:
     """Some calls are out then, others wait for a place, for a server, or have just been made."""

@@ -20,6 +20,8 @@ from tests.support.servers import ServerProcess
 from tests.support.serving import FORMS, Holder, echo_call
 from tests.support.times import LIMIT, TICK, until
 
+pytestmark = pytest.mark.slow
+
 MEGABYTE = 1_000_000
 
 

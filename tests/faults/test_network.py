@@ -117,6 +117,7 @@ async def test_link_with_the_stock_client(
     record(row)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("full", "seconds"), forms(8, 8, 30), indirect=["full"])
 async def test_cut_for_seconds(
     request: pytest.FixtureRequest,
@@ -139,6 +140,7 @@ async def test_cut_for_seconds(
     row.check()
 
 
+@pytest.mark.slow
 async def test_with_a_link_taken_down(
     request: pytest.FixtureRequest,
     hosts: LossyHosts,

@@ -7,8 +7,12 @@ the next participant.
 
 from __future__ import annotations
 
+import pytest
+
 from tests.faults.trial import Trial
 from tests.support.program import as_root, own_shared_memory, run_program
+
+pytestmark = pytest.mark.slow
 
 SHARED = """
 import contextlib, gc, os, resource, subprocess, tempfile
