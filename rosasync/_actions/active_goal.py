@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 
 __all__ = ["ActiveGoal", "FeedbackQueue", "Outcome"]
 
+FIRST_ASK = 5.0
+"""Seconds after which a result is asked for again. The intervals grow."""
+
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
@@ -99,7 +102,7 @@ class ActiveGoal:
         self.ending: asyncio.Task[None] | None = None
         self.detached = False
         self.ask_at = math.inf
-        self.ask_delay = 0.0
+        self.ask_delay = FIRST_ASK
         self.ended_at: float | None = None
         self._make_closed: Callable[[], Exception] | None = None
         self._readers: dict[FeedbackQueue, None] = {}

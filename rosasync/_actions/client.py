@@ -49,12 +49,10 @@ STATUS_PAUSE = 0.02
 """Seconds between two readings of the status topic: only the newest message counts."""
 GONE_DELAY = 0.1
 """Seconds to wait for the results that the last server sent just before it vanished."""
-FIRST_ASK = 5.0
-"""Seconds after which a result is asked for again. The intervals grow."""
 LAST_ASK = 300.0
 """Maximum number of seconds between two requests for a result."""
 ENDED_ASK = 0.5
-"""As FIRST_ASK, once the status topic has shown the end of the goal."""
+"""Seconds after which it is asked for again, once the status topic has shown the goal's end."""
 ENDED_PATIENCE = 30.0
 """Seconds to wait for the result of such a goal."""
 END_TIMEOUT = 60.0
@@ -556,7 +554,6 @@ class ActionClient:
                 goal.servers = self._find_servers()
             if goal.trace is not None:
                 goal.trace.enter("accepted")
-            goal.ask_delay = FIRST_ASK if goal.ended_at is None else ENDED_ASK
             self._ask(goal, room=stamp is not None)
         goal.answered.set()
 
