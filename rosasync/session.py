@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-import asyncio
-import importlib
-from collections.abc import AsyncIterator, Callable, Mapping
-from types import EllipsisType, TracebackType
-from typing import TYPE_CHECKING, Any, Generic, Literal, NoReturn, Self, overload
+from typing import TYPE_CHECKING, Any, Literal, NoReturn, Self, overload
 
-from rosasync._core.aio import call_in_thread
-from rosasync._core.core import Core, session_closed
-from rosasync._ros.middleware import check_middleware
+from rosasync._core.opening import Opening
+from rosasync._core.service_client import ServiceClient
 from rosasync.errors import UsageError
 from rosasync.options import Limits, Retry, SessionOptions, check_timeout
-from rosasync.statistics import SessionStatistics
 from rosasync.typing import (
     ActionType,
     FeedbackT,
@@ -26,7 +20,10 @@ from rosasync.typing import (
 )
 
 if TYPE_CHECKING:
+    import asyncio
+    from collections.abc import AsyncIterator, Callable, Mapping
     from contextlib import AbstractAsyncContextManager
+    from types import TracebackType
     from uuid import UUID
 
     from rclpy.context import Context
@@ -39,15 +36,13 @@ if TYPE_CHECKING:
     from rosasync._actions.intake import CancelHook, GoalHook
     from rosasync._actions.server import ActionServer
     from rosasync._client.pool import ClientPool
-    from rosasync._client.service import ServicePool
     from rosasync._client.service_watch import ServiceState
-    from rosasync._core.gateway import LoopGateway
+    from rosasync._core.core import Core
     from rosasync._core.portal import Portal
-    from rosasync._core.ports import NodePort
-    from rosasync._ros.node import RosNode
     from rosasync._server.handlers import ErrorHook, Handler, OverloadHook
     from rosasync._server.server import Order, ServiceServer
     from rosasync._server.status import Status
+    from rosasync.statistics import SessionStatistics
     from rosasync.tracing import Trace
 
 __all__ = ["ServiceClient", "Session"]
@@ -102,7 +97,7 @@ class Session:
         introspection: Literal["off", "metadata", "contents"] = "off",
         trace: Trace | None = None,
     ) -> None:
-        self._options = SessionOptions(
+        options = SessionOptions(
             node=node,
             context=context,
             executor=executor,
@@ -113,15 +108,12 @@ class Session:
             introspection=introspection,
             trace=trace,
         )
-        self._core: Core | None = None
-        # Whether it was closed before it was open. Once it is open, `Core.closed` counts.
-        self._closed = False
-        self._opening = False
+        self._opening = Opening(options)
 
     def __repr__(self) -> str:
-        core = self._core
+        core = self._opening.core
         if core is None:
-            return f"<Session {self._options.node!r} not open>"
+            return f"<Session {self._opening.options.node!r} not open>"
         state = "closed" if core.closed else f"{core.node.bridge} bridge, {core.pool!r}"
         return f"<Session {core.name!r} {state}>"
 
@@ -146,16 +138,7 @@ class Session:
             OSError: the process is out of file descriptors.
             RosasyncError: the process is out of threads, or rclpy cannot create the node.
         """
-        if self._core is not None or self._closed or self._opening:
-            raise UsageError("a session can be opened only once: create a new one")
-        self._opening = True
-        try:
-            await self._load()
-        finally:
-            self._opening = False
-        if self._closed:
-            raise session_closed()
-        self._core = Core(self, self._options, self._open_node)
+        await self._opening.open(self)
         return self
 
     async def __aenter__(self) -> Self:
@@ -182,14 +165,15 @@ class Session:
         await self.aclose()
 
     def __del__(self) -> None:
-        core = getattr(self, "_core", None)
-        if core is not None and not core.closed:
-            core.abandon(self)
+        # There is none if the constructor has refused its arguments.
+        opening = getattr(self, "_opening", None)
+        if opening is not None and opening.core is not None and not opening.closed:
+            opening.core.abandon(self)
 
     @property
     def closed(self) -> bool:
         """Whether the session has been closed, or has begun to close."""
-        return self._closed if self._core is None else self._core.closed
+        return self._opening.closed
 
     @property
     def bridge(self) -> str:
@@ -214,19 +198,11 @@ class Session:
     @property
     def core(self) -> Core:
         """The parts of the open session, for rosasync itself. Not part of the public API."""
-        if self._core is None:
-            raise _not_open()
-        return self._core
+        return self._opening.parts()
 
     def statistics(self) -> SessionStatistics:
         """Take a snapshot of the session's statistics. After the close it shows the final ones."""
-        core = self.core
-        return SessionStatistics(
-            bridge=core.node.bridge,
-            pool=core.pool.statistics(),
-            servers=tuple(server.statistics() for server in core.servers),
-            action_servers=tuple(server.statistics() for server in core.action_servers),
-        )
+        return self.core.statistics()
 
     @overload
     async def call(
@@ -294,8 +270,8 @@ class Session:
             TypeError, ValueError: an argument does not fit; nothing was sent.
             UsageError: called from another loop or thread.
         """
-        # `_use`, inlined, because this runs for every call.
-        core = self._core or self._use()
+        # `Opening.use`, inlined, because this runs for every call.
+        core = self._opening.core or self._opening.use()
         core.check_loop()
         service = core.pool.service(srv_type, srv_name, qos)
         message, seconds = core.arguments.call(
@@ -348,7 +324,7 @@ class Session:
         For the arguments and errors, see `call`. Wrong arguments raise here, everything later is
         raised by the task.
         """
-        core = self._use()
+        core = self._opening.use()
         service = core.pool.service(srv_type, srv_name, qos)
         message, seconds = core.arguments.call(
             service.service, request, timeout, core.timeout, wait, retry
@@ -409,7 +385,7 @@ class Session:
             TypeError, ValueError: an argument does not fit.
             SessionClosed, ContextShutdown: the session has ended.
         """
-        core = self._use()
+        core = self._opening.use()
         service = core.pool.service(srv_type, srv_name, qos)
         # All arguments are checked before anything is made.
         seconds = core.arguments.defaults(timeout, core.timeout, wait, retry)
@@ -440,7 +416,7 @@ class Session:
                 instead.
             SessionClosed, ContextShutdown: the session ended.
         """
-        core = self._use()
+        core = self._opening.use()
         service = core.pool.service(srv_type, srv_name, qos)
         await service.wait_for_server(check_timeout(timeout, core.timeout))
         return True
@@ -472,7 +448,7 @@ class Session:
             TypeError, ValueError, InvalidServiceName: an argument does not fit.
             SessionClosed, ContextShutdown: the session ended.
         """
-        core = self._use()
+        core = self._opening.use()
         service = core.arguments.service(srv_type, srv_name, qos)
         async for state in core.pool.watch(service):
             yield state
@@ -489,7 +465,7 @@ class Session:
         The first query for a service may return False, because it takes some milliseconds to match
         a new client.
         """
-        return self._use().pool.service(srv_type, srv_name, qos).match()
+        return self._opening.use().pool.service(srv_type, srv_name, qos).match()
 
     @overload
     def serve(
@@ -595,7 +571,7 @@ class Session:
             UsageError: this process serves or calls another type under this name.
             SessionClosed, ContextShutdown: the session has ended, or has begun to.
         """
-        return self._use().serve(
+        return self._opening.use().serve(
             srv_type,
             srv_name,
             handler,
@@ -701,7 +677,7 @@ class Session:
             UsageError: this process serves or calls another type under this name.
             SessionClosed, ContextShutdown: the session has ended, or has begun to.
         """
-        return self._use().serve_action(
+        return self._opening.use().serve_action(
             self.serve,
             action_type,
             action_name,
@@ -781,7 +757,7 @@ class Session:
             TypeError, ValueError: an argument does not fit; nothing was sent.
             UsageError: called from another loop or thread.
         """
-        core = self._use()
+        core = self._opening.use()
         seconds = check_timeout(timeout, None)
         arguments = core.actions.arguments(action_type, action_name, goal, accept_timeout, wait)
         return await core.actions.act(arguments, seconds, on_feedback)
@@ -851,7 +827,7 @@ class Session:
         Raises:
             Exception: entering raises as `act`, except `GoalAborted` and `GoalCanceled`.
         """
-        core = self._use()
+        core = self._opening.use()
         arguments = core.actions.arguments(action_type, action_name, goal, accept_timeout, wait)
         return core.actions.goal(arguments, feedback, cancel_timeout)
 
@@ -904,7 +880,7 @@ class Session:
             Exception: entering raises as `act` if there is no server. If the server does not know
                 the goal, ``goal.result()`` raises `GoalRejected`.
         """
-        core = self._use()
+        core = self._opening.use()
         return core.actions.attach(
             action_type, action_name, goal_id, accept_timeout, wait, feedback
         )
@@ -917,146 +893,4 @@ class Session:
         to end. Then the calls in progress end with `SessionClosed`. A cancellation does not cut
         this short.
         """
-        if self._core is None:
-            self._closed = True
-            return
-        self._core.check_loop()
-        await self._core.aclose()
-
-    async def _load(self) -> None:
-        """Import what `_open_node` needs. The session of `rosasync.testing` overrides this."""
-        await call_in_thread(_load_ros, "rosasync import")
-
-    def _open_node(
-        self, gateway: LoopGateway, on_graph: Callable[[], None], on_shutdown: Callable[[], None]
-    ) -> NodePort:
-        """Open the node. The session of `rosasync.testing` overrides this."""
-        ros_node: type[RosNode] = _import_ros("rosasync._ros.node").RosNode
-        return ros_node(self._options, gateway, on_graph, on_shutdown)
-
-    def _use(self) -> Core:
-        core = self._core
-        if core is None:
-            raise session_closed() if self._closed else _not_open()
-        core.check_loop()
-        return core
-
-
-class ServiceClient(Generic[RequestT, ResponseT]):
-    """A service type and name bound to a session; see `Session.client`."""
-
-    __slots__ = ("_core", "_retry", "_service", "_timeout", "_wait")
-
-    def __init__(
-        self,
-        core: Core,
-        service: ServicePool,
-        timeout: float | None,
-        wait: bool | float,
-        retry: Retry | None,
-    ) -> None:
-        self._core = core
-        self._service = service
-        self._timeout = timeout
-        self._wait = wait
-        self._retry = retry
-
-    def __repr__(self) -> str:
-        return f"<ServiceClient {self.srv_name} [{self.srv_type}]>"
-
-    @property
-    def srv_name(self) -> str:
-        """The resolved service name."""
-        return self._service.service.key.srv_name
-
-    @property
-    def srv_type(self) -> str:
-        """The name of the service type."""
-        return self._service.service.key.srv_type
-
-    @property
-    def ready(self) -> bool:
-        """Whether a server is matched, so that a call is sent at once."""
-        self._core.check_loop()
-        return self._service.match()
-
-    async def call(
-        self,
-        request: RequestT | Mapping[str, Any] | None = None,
-        *,
-        timeout: Timeout = ...,
-        wait: bool | float | EllipsisType = ...,
-        retry: Retry | None = None,
-    ) -> ResponseT:
-        """Call the service; see `Session.call`."""
-        core = self._core
-        core.check_loop()
-        service = self._service
-        if wait is ...:
-            wait = self._wait
-        if retry is None:
-            retry = self._retry
-        message, seconds = core.arguments.call(
-            service.service, request, timeout, self._timeout, wait, retry
-        )
-        response: ResponseT = await service.call(message, seconds, wait, retry)
-        return response
-
-    def start(
-        self,
-        request: RequestT | Mapping[str, Any] | None = None,
-        *,
-        timeout: Timeout = ...,
-        wait: bool | float | EllipsisType = ...,
-        retry: Retry | None = None,
-    ) -> asyncio.Task[ResponseT]:
-        """Start the same call as a task; see `Session.start`."""
-        core = self._core
-        core.check_loop()
-        service = self._service
-        if wait is ...:
-            wait = self._wait
-        if retry is None:
-            retry = self._retry
-        message, seconds = core.arguments.call(
-            service.service, request, timeout, self._timeout, wait, retry
-        )
-        service.check_open()
-        return service.start(message, seconds, wait, retry, copy=request is not None)
-
-    async def wait(self, timeout: Timeout = None) -> Literal[True]:
-        """Wait until a server is matched, and return True; see `Session.wait_for_service`."""
-        self._core.check_loop()
-        await self._service.wait_for_server(check_timeout(timeout, self._timeout))
-        return True
-
-
-def _not_open() -> UsageError:
-    return UsageError(
-        "the session is not open: use `async with rosasync.Session(…) as session:`, or "
-        "`await session.open()`"
-    )
-
-
-def _load_ros() -> None:
-    """Import rclpy and what it loads for the first node; raises as `_import_ros`."""
-    _import_ros("rosasync._ros.node")
-    _import_ros("rosasync._ros.type_supports").load()
-
-
-def _import_ros(module: str) -> Any:
-    """Import a module that needs rclpy.
-
-    Raises:
-        ImportError: rclpy is not installed, or the middleware that the environment names; the
-            message says what to do.
-    """
-    check_middleware()
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise ImportError(
-            f"rosasync needs rclpy, which cannot be imported here ({error}). Without a ROS "
-            "installation: pip install 'rosasync[jazzy]' (or [kilted]). With one: source its "
-            "setup file, /opt/ros/<distribution>/setup.bash, and use its Python"
-        ) from error
+        await self._opening.aclose()

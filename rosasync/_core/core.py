@@ -25,6 +25,7 @@ from rosasync._core.portal import Portal
 from rosasync._server.server import ServiceServer
 from rosasync._status.reporter import Reporter
 from rosasync.errors import ContextShutdown, SessionClosed, UsageError
+from rosasync.statistics import SessionStatistics
 from rosasync.tracing import Tracing
 
 if TYPE_CHECKING:
@@ -141,6 +142,15 @@ class Core:
             )
         self.action_servers[server] = None
         return server
+
+    def statistics(self) -> SessionStatistics:
+        """Take a snapshot of the statistics; see `rosasync.Session.statistics`."""
+        return SessionStatistics(
+            bridge=self.node.bridge,
+            pool=self.pool.statistics(),
+            servers=tuple(server.statistics() for server in self.servers),
+            action_servers=tuple(server.statistics() for server in self.action_servers),
+        )
 
     async def aclose(self) -> None:
         """End everything; idempotent. All callers wait for the same task."""

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+from rosasync._core.opening import RosOpener
 from rosasync.session import Session
 from rosasync.testing._memory.graph import MemoryNode
 
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
         Service,
         ServicePort,
     )
+    from rosasync.options import SessionOptions
     from rosasync.testing._faults import OpenService
     from rosasync.testing._memory.graph import MemoryGraph
 
@@ -75,25 +77,35 @@ class GraphSession(Session):
 
     def __init__(self, hooks: Hooks, memory: MemoryGraph | None, node: Any, **options: Any) -> None:
         super().__init__(node, **options)
+        self._opening.opener = _HookedOpener(hooks, memory)
+
+
+class _HookedOpener(RosOpener):
+    """Opens nodes that have hooks, in memory and on real ROS."""
+
+    def __init__(self, hooks: Hooks, memory: MemoryGraph | None) -> None:
         self._hooks = hooks
         self._memory = memory
 
-    async def _load(self) -> None:
-        # A graph in memory needs no rclpy.
+    async def load(self) -> None:
+        """Import what the nodes need: a graph in memory needs no rclpy."""
         if self._memory is None:
-            await super()._load()
+            await super().load()
 
-    def _open_node(
-        self, gateway: LoopGateway, on_graph: Callable[[], None], on_shutdown: Callable[[], None]
+    def open(
+        self,
+        options: SessionOptions,
+        gateway: LoopGateway,
+        on_graph: Callable[[], None],
+        on_shutdown: Callable[[], None],
     ) -> NodePort:
+        """Open a node."""
         if self._memory is not None:
-            name = str(self._options.node)
+            name = str(options.node)
             return HookedMemoryNode(self._memory, self._hooks, name, on_graph, on_shutdown)
         # Only now, because a graph in memory needs no rclpy.
         module = importlib.import_module("rosasync.testing._ros_node")
-        node: NodePort = module.HookedRosNode(
-            self._options, gateway, on_graph, on_shutdown, self._hooks
-        )
+        node: NodePort = module.HookedRosNode(options, gateway, on_graph, on_shutdown, self._hooks)
         return node
 
 
