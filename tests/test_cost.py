@@ -166,9 +166,11 @@ async def test_one_of_ten_calls_at_once(session: Session, echo: str) -> None:
     async def ten() -> None:
         await asyncio.gather(*(client.call(request) for _ in range(AT_ONCE)))
 
-    # Sometimes the loop tries to take a response that it has already taken with another one.
+    # On a busy machine the responses come in several batches, and each batch wakes the loop. And
+    # sometimes the loop tries to take a response that it has already taken with another one.
     bound = BOUNDS[session.bridge]
-    assert await cost_of(ten, AT_ONCE) <= replace(bound, functions=bound.functions + 1)
+    more = replace(bound, functions=bound.functions + 1, c_functions=bound.c_functions + 1)
+    assert await cost_of(ten, AT_ONCE) <= more
 
 
 async def test_a_server_with_status_costs_its_callers_nothing(fake_graph: FakeGraph) -> None:
