@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from uuid import uuid4
 
 import pytest
+from std_srvs.srv import Trigger
 from test_msgs.action import Fibonacci, NestedMessage
 
 from rosasync import (
@@ -173,7 +174,8 @@ async def test_a_timeout_cancels_the_goal(
     session: Session, action_server: ActionServerProcess
 ) -> None:
     await action_server.serve("/held", hold=True)
-    with pytest.raises(GoalTimeout, match="has not ended within 0.5 s; it is cancelled") as caught:
+    await session.wait_for_service(Fibonacci.Impl.SendGoalService, "/held/_action/send_goal")
+    with pytest.raises(GoalTimeout, match="within 0.5 s; it is cancelled") as caught:
         await session.act(Fibonacci, "/held", timeout=0.5, accept_timeout=LIMIT)
     assert isinstance(caught.value, TimeoutError)
     await none_runs(action_server, "/held")
@@ -251,6 +253,21 @@ async def test_there_is_no_server(session: Session) -> None:
         await session.act(Fibonacci, "/nothing", wait=False)
     with pytest.raises(ServiceUnavailable):
         await session.act(Fibonacci, "/nothing", wait=2 * TICK)
+    with pytest.raises(ServiceUnavailable, match="/nothing: no action server for"):
+        await session.act(Fibonacci, "/nothing", timeout=4 * TICK)
+
+
+async def test_a_similar_name_is_that_of_an_action(
+    session: Session, action_server: ActionServerProcess
+) -> None:
+    await action_server.serve("/fibonacci")
+    await session.wait_for_service(Fibonacci.Impl.SendGoalService, "/fibonacci/_action/send_goal")
+    similar = r"there are /fibonacci \(test_msgs/action/Fibonacci\)$"
+    with pytest.raises(ServiceUnavailable, match=similar):
+        await session.act(Fibonacci, "/fibonaci", wait=False)
+    with pytest.raises(ServiceUnavailable) as caught:
+        await session.call(Trigger, "/fibonacci/_action/cancel", wait=False)
+    assert "there are /fibonacci/_action/cancel_goal" in str(caught.value)
 
 
 async def test_the_server_vanishes(session: Session, action_server: ActionServerProcess) -> None:

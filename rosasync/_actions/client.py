@@ -228,6 +228,19 @@ class ActionClient:
         goal.servers = self._find_servers()
         self._ask(goal)
 
+    def timed_out(self, goal: ActiveGoal, seconds: float) -> CallError:
+        """Return the error for a goal whose deadline has passed: it says how far the goal got."""
+        if goal.acceptance is None:
+            with suppress(ContextShutdown):
+                if not self.is_provided():
+                    return self.errors.unavailable(goal)
+            what = f"the goal was not sent within {seconds:.3g} s: no place in the window"
+        elif not goal.answered.is_set():
+            what = f"the goal was sent, but not answered within {seconds:.3g} s; it is cancelled"
+        else:
+            what = f"the goal has not ended within {seconds:.3g} s; it is cancelled"
+        return self.errors.goal(GoalTimeout, goal, what)
+
     def leave(self, goal: ActiveGoal, queue: FeedbackQueue, owns: bool) -> None:
         """Let a handle go; if it owns the goal, the goal is cancelled unless it was detached."""
         goal.leave(queue)

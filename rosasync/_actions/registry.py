@@ -13,7 +13,7 @@ from uuid import UUID, uuid4
 from rosasync._actions.active_goal import ActiveGoal
 from rosasync._actions.client import ActionClient
 from rosasync._actions.goal import Goal
-from rosasync.errors import CallError, GoalTimeout
+from rosasync.errors import CallError
 from rosasync.options import check_count, check_seconds, check_timeout
 
 if TYPE_CHECKING:
@@ -143,9 +143,8 @@ class Actions:
         except TimeoutError as error:
             if not deadline.expired() or isinstance(error, CallError):
                 raise
-            what = f"the goal has not ended within {timeout:.3g} s; it is cancelled"
-            errors = self.client(arguments.action).errors
-            raise errors.goal(GoalTimeout, goal, what) from None
+            assert timeout is not None
+            raise self.client(arguments.action).timed_out(goal, timeout) from None
 
     def goal(
         self,

@@ -29,7 +29,7 @@ from rosasync._ros.endpoints import (
     serves,
 )
 from rosasync._ros.failures import uses_node
-from rosasync._ros.names import default_qos
+from rosasync._ros.names import SEND_GOAL, default_qos
 from rosasync._ros.rcl import Rcl
 from rosasync._ros.silence import explain_silence
 
@@ -282,6 +282,11 @@ def describe_similar(
         srv_name: the name.
         srv_type: the type that is meant, if it is known: services of this type are listed too.
     """
+    # An action is one of its services here; the others of it are not what is meant.
+    if srv_name.endswith(SEND_GOAL):
+        services = {name: types for name, types in services.items() if name.endswith(SEND_GOAL)}
+    elif "/_" not in srv_name:
+        services = {name: types for name, types in services.items() if "/_" not in name}
     similar = difflib.get_close_matches(srv_name, services, n=3, cutoff=0.7)
     same_type = sorted(name for name, types in services.items() if srv_type in types)
     names = dict.fromkeys([*similar, *same_type[:3]])

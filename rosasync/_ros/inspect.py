@@ -24,7 +24,7 @@ from rosasync._ros.endpoints import (
     response_writers,
     servers_of,
 )
-from rosasync._ros.names import default_qos
+from rosasync._ros.names import SEND_GOAL, default_qos
 from rosasync._ros.silence import DISCOVERY_TOPIC, explain_silence
 
 __all__ = [
@@ -61,9 +61,6 @@ UNEXPLAINED = (
 SAFE_DOMAINS = 102
 """The ports of higher domains are also used for other purposes (Linux's ephemeral ports)."""
 
-
-SEND_GOAL = "/_action/send_goal"
-"""How the name of the service ends that accepts the goals of an action."""
 
 GOAL_TYPE = "_SendGoal"
 """How the type of this service ends."""

@@ -22,6 +22,7 @@ from rosasync.statistics import ServiceKey
 __all__ = [
     "DEPTH",
     "DEPTH_WITHOUT_HEARTBEATS",
+    "SEND_GOAL",
     "default_qos",
     "describe",
     "describe_action",
@@ -35,6 +36,9 @@ default get lost."""
 DEPTH_WITHOUT_HEARTBEATS = 10
 """History of clients, at least, without the profile: where packets get lost, a deep history blocks
 behind each of them for 3 s (docs/explanation/network.md)."""
+
+SEND_GOAL = "/_action/send_goal"
+"""How the name of the service ends that accepts the goals of an action."""
 
 
 _RCL_SAYS = (
@@ -69,7 +73,7 @@ def describe_action(node: Node, wanted: Any, action_name: str) -> Action:
         action_class,
         expanded,
         type_name(action_class),
-        describe(node, implementation.SendGoalService, f"{prefix}/send_goal", None),
+        describe(node, implementation.SendGoalService, f"{action_name}{SEND_GOAL}", None),
         describe(node, implementation.CancelGoalService, f"{prefix}/cancel_goal", None),
         describe(node, implementation.GetResultService, f"{prefix}/get_result", None),
         f"{prefix}/feedback",
