@@ -12,6 +12,7 @@ from benchmarks.runner import Scenario
 from benchmarks.targets import PEERS, TARGETS
 from benchmarks.ticks import make_ticks
 from benchmarks.work import SERVERS, Work
+from rosasync._core.text import count
 
 __all__ = ["SUITES", "make_suite"]
 
@@ -100,7 +101,7 @@ def _callers(callers: int) -> Scenario:
 
 def _services(services: int) -> Scenario:
     return Scenario(
-        f"{services} services",
+        count(services, "service"),
         "services",
         LEADING,
         dataclasses.replace(LEAN, services=services),

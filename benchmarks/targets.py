@@ -133,7 +133,7 @@ TARGETS = (
     ),
     Target(
         "direct, eight callers, 500 services in use, calls/s / 1 service",
-        *("rate", ">=", 0.7, ("500 services", "direct"), ("1 services", "direct")),
+        *("rate", ">=", 0.7, ("500 services", "direct"), ("1 service", "direct")),
     ),
     Target(
         "direct, 1 MB payload, median latency / the floor",

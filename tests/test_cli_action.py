@@ -64,7 +64,9 @@ class TestGraph:
         assert json_lines(done.stdout) == [{"name": QUICK, "types": [FIBONACCI]}]
         done = rosasync("action", "type", "/cli/none", "--timeout", "0.5")
         assert (done.returncode, done.stdout) == (3, "")
-        assert "no server within 0.5 s. Try: rosasync action list" in done.stderr
+        assert "no server of this name within 0.5 s. Try: rosasync action list" in done.stderr
+        done = rosasync("action", "type", f"{QUICK}_", "--timeout", "0.5")
+        assert f"; there are {QUICK} ({FIBONACCI}). Try: rosasync action list" in done.stderr
 
     def test_info(self) -> None:
         done = rosasync("action", "info", QUICK)
@@ -73,7 +75,10 @@ class TestGraph:
         assert "clients: 0" in done.stdout
         (server,) = json_lines(rosasync("action", "info", QUICK, "--json").stdout)
         assert (server["role"], server["type"]) == ("server", FIBONACCI)
-        assert rosasync("action", "info", "/cli/none").returncode == 3
+        done = rosasync("action", "info", f"{QUICK}_")
+        assert done.returncode == 3
+        assert f"; there are {QUICK} ({FIBONACCI})" in done.stderr
+        assert f"{QUICK}: no server of this name; it is an action" in rosasync("info", QUICK).stderr
 
 
 @pytest.mark.usefixtures("quick")

@@ -42,6 +42,9 @@ def test_type_and_find() -> None:
     missing = rosasync("type", "/lamp/swich", "--timeout", "1")
     assert (missing.returncode, missing.stdout) == (3, "")
     assert f"there are {LAMP} ({LAMP_TYPE})" in missing.stderr
+    missing = rosasync("info", "/lamp/swich")
+    assert (missing.returncode, missing.stdout) == (3, "/lamp/swich\nservers: 0\nclients: 0\n")
+    assert f"there are {LAMP} ({LAMP_TYPE})" in missing.stderr
 
 
 def test_info_shows_nodes_and_clashes() -> None:

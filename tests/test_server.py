@@ -128,7 +128,7 @@ class TestLimits:
         await until(lambda: server.statistics().rejected == 4)
         assert server.statistics().dropped == 4
         assert len(caplog.messages) == 1
-        assert "/served: overloaded, with 1 requests waiting" in caplog.text
+        assert "/served: overloaded, with 1 request waiting" in caplog.text
         gate.set()
         assert [await tasks[0], await tasks[5]] == ["0", "5"]
         await settled(server)

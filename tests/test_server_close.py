@@ -92,7 +92,7 @@ class TestClose:
             with pytest.raises(ServerGone):
                 await task
         assert sum("was cancelled" in message for message in caplog.messages) == 2
-        assert sum("1 requests waiting" in message for message in caplog.messages) == 1
+        assert sum("1 request waiting" in message for message in caplog.messages) == 1
 
     async def test_no_request_is_taken_meanwhile(self, session: Session) -> None:
         gate = Gate()

@@ -124,7 +124,7 @@ async def test_what_it_logs_and_counts(
         )
         assert "the newest request of each is served first" in begun
         assert over.startswith("/served: no longer overloaded, after 1.")
-        assert over.endswith("s in which 4 requests were dropped")
+        assert over.endswith("s, with 4 requests dropped")
         handler.steps.release()
         await ask(session, "/served", "one that does not wait")
         assert server.statistics().last_age == 0.0

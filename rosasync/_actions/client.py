@@ -15,6 +15,7 @@ from rosasync._actions.results import ResultRequests
 from rosasync._actions.status import TERMINAL, GoalStatus, read_statuses, uuid_bytes, uuid_of
 from rosasync._core.aio import start_task
 from rosasync._core.ports import TopicQos
+from rosasync._core.text import count
 from rosasync.errors import (
     CallError,
     CancelRejected,
@@ -130,7 +131,7 @@ class ActionClient:
         self._gone_timer: asyncio.TimerHandle | None = None
 
     def __repr__(self) -> str:
-        return f"<ActionClient {self.action.name} {len(self._goals)} goals>"
+        return f"<ActionClient {self.action.name} {count(len(self._goals), 'goal')}>"
 
     @property
     def goals(self) -> tuple[ActiveGoal, ...]:

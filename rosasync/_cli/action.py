@@ -15,6 +15,7 @@ from rosasync._cli.actions import (
     OptionalActionType,
     actions_of,
     endpoints_of,
+    meant_instead,
     no_server,
     wait_for_types,
 )
@@ -102,8 +103,8 @@ def type_of(
 async def _type_of(name: str, as_json: bool, timeout: float) -> None:
     async with open_session() as session:
         types = await wait_for_types(session, name, timeout)
-    if not types:
-        raise no_server(name, timeout)
+        if not types:
+            raise no_server(session, name, timeout)
     if as_json:
         print_json({"name": name, "types": types})
     else:
@@ -127,6 +128,8 @@ async def _info(name: str, as_json: bool, wait: float | None) -> int:
         resolved = resolve(session, name)
         await settle(session, wait)
         servers, clients = endpoints_of(session, resolved)
+        if not servers:
+            note(f"{name}: no server of this name{meant_instead(session, name)}")
     if as_json:
         for role, endpoints in (("server", servers), ("client", clients)):
             for endpoint in endpoints:
@@ -225,7 +228,7 @@ async def _cancel(
     async with open_session(timeout) as session:
         # Its absence is reported by the action's name.
         if not await wait_for_types(session, name, timeout):
-            raise no_server(name, timeout)
+            raise no_server(session, name, timeout)
         response: Any = await session.call(
             "action_msgs/srv/CancelGoal", f"{name}/_action/cancel_goal", request
         )

@@ -25,6 +25,7 @@ __all__ = [
     "actions_of",
     "endpoints_of",
     "find_type",
+    "meant_instead",
     "no_server",
     "wait_for_types",
 ]
@@ -85,11 +86,7 @@ async def find_type(session: rosasync.Session, name: str, timeout: float) -> str
     """
     types = await wait_for_types(session, name, timeout)
     if not types:
-        raise CliError(
-            f"{name}: no server within {timeout:g} s, so its type is not known. Give the TYPE, or "
-            "try: rosasync action list",
-            Code.NO_SERVER,
-        )
+        raise no_server(session, name, timeout)
     if len(types) > 1:
         raise CliError(f"{name} is served with several types: give one of {', '.join(types)}")
     return types[0]
@@ -114,8 +111,19 @@ def action_class(name: str) -> Any:
         raise CliError(explain_type(name, error)) from None
 
 
-def no_server(name: str, timeout: float) -> CliError:
-    """Return the error for an action that has no server."""
-    return CliError(
-        f"{name}: no server within {timeout:g} s. Try: rosasync action list", Code.NO_SERVER
-    )
+def no_server(session: rosasync.Session, name: str, timeout: float) -> CliError:
+    """Return the error for an action that has no server; it lists the similar names."""
+    missing = f"{name}: no server of this name within {timeout:g} s"
+    return CliError(f"{missing}{meant_instead(session, name)}", Code.NO_SERVER)
+
+
+def meant_instead(session: rosasync.Session, name: str) -> str:
+    """Return what may be meant by an action without a server, and what to try, as a text's end."""
+    from rosasync._ros.graph import describe_similar
+    from rosasync._ros.inspect import served_types
+
+    resolved = resolve(session, name)
+    if served_types(session.node, resolved):
+        return f"; it is a service. Try: rosasync info {name}"
+    similar = describe_similar(actions_of(session), resolved)
+    return f"{f'; there are {similar}' if similar else ''}. Try: rosasync action list"

@@ -18,6 +18,7 @@ from rosasync._cli.graph import settle
 from rosasync._cli.options import AsJson
 from rosasync._cli.run import open_session, run
 from rosasync._cli.why import environment
+from rosasync._core.text import count
 from rosasync._demo.server import stock_server
 from rosasync._ros.domain import environment_domain
 from rosasync._ros.fresh_ports import dead_ports
@@ -130,9 +131,9 @@ def _ports(report: Report) -> bool:
         report.add(
             "ports",
             None,
-            f"dead processes have left {len(dead)} files of ports behind. The next process of the "
-            "same number is reached only after seconds, unless it is a session or was started by "
-            "rosasync run",
+            f"dead processes have left {count(len(dead), 'file')} of ports behind. The next "
+            "process of the same number is reached only after seconds, unless it is a session or "
+            "was started by rosasync run",
             removal_command(dead),
         )
     return not left

@@ -15,6 +15,7 @@ __all__ = [
     "explain_type",
     "find_type",
     "is_hidden",
+    "meant_instead",
     "no_server",
     "resolve",
     "settle",
@@ -87,18 +88,24 @@ async def find_type(session: rosasync.Session, name: str, timeout: float | None)
 
 
 def no_server(session: rosasync.Session, name: str, timeout: float | None) -> CliError:
-    """Return the error for a service that has no server; it lists the similar names."""
-    from rosasync._ros.graph import describe_similar
-    from rosasync._ros.inspect import services
+    """Return the error for a service that has no server; it says what may be meant instead."""
+    within = "" if timeout is None else f" within {timeout:g} s"
+    missing = f"{name}: no server of this name{within}"
+    return CliError(f"{missing}{meant_instead(session, name)}", Code.NO_SERVER)
 
+
+def meant_instead(session: rosasync.Session, name: str) -> str:
+    """Return what may be meant by a service without a server, and what to try, as a text's end."""
+    from rosasync._ros.graph import describe_similar
+    from rosasync._ros.inspect import actions, services
+
+    resolved = resolve(session, name)
+    if resolved in actions(session.node):
+        return f"; it is an action. Try: rosasync action info {name}"
     own = f"{session.node.get_fully_qualified_name()}/"
     others = {n: types for n, types in services(session.node).items() if not n.startswith(own)}
-    similar = describe_similar(others, resolve(session, name))
-    instead = f"; there are {similar}" if similar else ""
-    within = "" if timeout is None else f" within {timeout:g} s"
-    return CliError(
-        f"{name}: no server of this name{within}{instead}. Try: rosasync why {name}", Code.NO_SERVER
-    )
+    similar = describe_similar(others, resolved)
+    return f"{f'; there are {similar}' if similar else ''}. Try: rosasync why {name}"
 
 
 def srv_class(name: str) -> Any:

@@ -8,9 +8,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rosasync._cli.errors import Code
-from rosasync._cli.graph import is_hidden, no_server, resolve, settle, wait_for_types
+from rosasync._cli.graph import (
+    is_hidden,
+    meant_instead,
+    no_server,
+    resolve,
+    settle,
+    wait_for_types,
+)
 from rosasync._cli.options import AsJson, Hidden, Name, Type, Wait
-from rosasync._cli.output import print_json
+from rosasync._cli.output import note, print_json
 from rosasync._cli.run import open_session, run
 
 if TYPE_CHECKING:
@@ -117,6 +124,8 @@ async def _info(name: str, as_json: bool, wait: float | None) -> int:
 
         servers = server_endpoints(session.node, resolved)
         clients = client_endpoints(session.node, resolved)
+        if not servers:
+            note(f"{name}: no server of this name{meant_instead(session, name)}")
     if as_json:
         for role, endpoint in [("server", e) for e in servers] + [("client", e) for e in clients]:
             print_json({"role": role, **_described(endpoint)})

@@ -11,6 +11,7 @@ from rosasync._cli.errors import Code
 from rosasync._cli.graph import explain_type, is_hidden, resolve, settle
 from rosasync._cli.options import AsJson, Name, OptionalType, Wait
 from rosasync._cli.run import open_session, run
+from rosasync._core.text import count
 from rosasync._ros.domain import SAFE, environment_domain
 from rosasync._ros.profile import SWITCH, switched_off
 from rosasync._ros.types import service_type
@@ -143,7 +144,7 @@ def _nodes(report: Report, session: rosasync.Session) -> bool:
     report.add(
         "nodes",
         bool(others),
-        f"{len(others)} others are visible{': ' if others else ''}{shown}",
+        f"{count(len(others), 'other')} visible{': ' if others else ''}{shown}",
         "Start the server, or compare ROS_DOMAIN_ID, ROS_AUTOMATIC_DISCOVERY_RANGE and "
         f"RMW_IMPLEMENTATION with its{hint}",
     )

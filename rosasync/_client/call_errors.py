@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from rosasync._core.text import duration
+from rosasync._core.text import count, duration
 from rosasync._status.wire import Outcome
 from rosasync.errors import (
     CallError,
@@ -77,9 +77,9 @@ class CallErrors:
     def queue_timeout(self, elapsed: float, in_flight: int, abandoned: int) -> CallError:
         """Return the error for a call that found a server, but no free client."""
         message = (
-            f"no client became free within {duration(elapsed)}: {in_flight} requests are in "
-            f"flight, and {abandoned} abandoned requests (cancelled or timed out) still count; the "
-            "server is slower than its callers"
+            f"no client became free within {duration(elapsed)}: {count(in_flight, 'request')} in "
+            f"flight, and {count(abandoned, 'abandoned request')} (cancelled or timed out) still "
+            "counted; the server is slower than its callers"
         )
         return self._make(QueueTimeout, message, elapsed)
 
@@ -131,9 +131,9 @@ class CallErrors:
     def pool_full(self, waiting: int, limit: int) -> PoolFull:
         """Return the error for a call that finds the queue full."""
         return PoolFull(
-            f"{self._service.key.srv_name}: {waiting} callers wait for a client, and "
-            f"Limits.waiting={limit}: the server is slower than its callers, so call less often, "
-            "or raise the limit"
+            f"{self._service.key.srv_name}: {count(waiting, 'caller')} in the queue for a client, "
+            f"and Limits.waiting={limit}: the server is slower than its callers, so call less "
+            "often, or raise the limit"
         )
 
     def _explain_missing(self) -> str:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from rosasync._client.sent import Sent
 from rosasync._client.window import Window
+from rosasync._core.text import count
 
 if TYPE_CHECKING:
     from rosasync._client.counts import Counts
@@ -114,7 +115,7 @@ class Client:
 
     def __repr__(self) -> str:
         state = "closed" if self.closed else "idle" if self.is_idle else "in use"
-        return f"<Client {state}, {self.calls} calls, {self.window!r}>"
+        return f"<Client {state}, {count(self.calls, 'call')}, {self.window!r}>"
 
     @property
     def identity(self) -> Hashable:

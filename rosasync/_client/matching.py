@@ -6,6 +6,8 @@ import asyncio
 import logging
 from typing import TYPE_CHECKING, Protocol
 
+from rosasync._core.text import count
+
 if TYPE_CHECKING:
     from rosasync._client.graph_watch import GraphWatch
     from rosasync._core.ports import NodePort, Servers, Service
@@ -73,11 +75,11 @@ class Matching:
 
     def count_servers(self) -> None:
         """Count the servers of the name. Call it after every change of the graph."""
-        count = self._node.count_servers(self._service)
-        if count != self.count:
+        servers = self._node.count_servers(self._service)
+        if servers != self.count:
             name = self._service.key.srv_name
-            logger.debug("%s: the graph shows %d server%s", name, count, "" if count == 1 else "s")
-        self.count = count
+            logger.debug("%s: the graph shows %s", name, count(servers, "server"))
+        self.count = servers
 
     def learn(self) -> None:
         """Query the servers, unless that was done in this generation, and pass them on."""

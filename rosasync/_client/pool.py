@@ -13,6 +13,7 @@ from rosasync._client.latency import summarize
 from rosasync._client.service import MATCH_TIMEOUT, ServicePool
 from rosasync._client.service_watch import ServiceState, watch_servers
 from rosasync._core.aio import Deadlines
+from rosasync._core.text import count
 from rosasync._status.listener import Listener
 from rosasync.errors import UsageError
 from rosasync.options import check_count, check_limits, check_timeout
@@ -69,7 +70,8 @@ class ClientPool:
     def __repr__(self) -> str:
         total = self.statistics()
         return (
-            f"<ClientPool {len(self._services)} services, {total.clients} clients, "
+            f"<ClientPool {count(len(self._services), 'service')}, "
+            f"{count(total.clients, 'client')}, "
             f"{total.idle} idle, {total.in_flight} in flight, {total.waiting} waiting>"
         )
 
@@ -264,8 +266,11 @@ def _statistics_of(pools: list[ServicePool]) -> KeyStatistics:
     """Return the statistics of one service, whose pools differ in their limits."""
     if len(pools) == 1:
         return pools[0].statistics()
-    latency = summarize(pool.latencies for pool in pools)
-    return KeyStatistics(**_sums([pool.statistics() for pool in pools]), latency=latency)
+    statistics = [pool.statistics() for pool in pools]
+    sums = _sums(statistics)
+    # All of them see the same servers.
+    sums["servers"] = max(one.servers for one in statistics)
+    return KeyStatistics(**sums, latency=summarize(pool.latencies for pool in pools))
 
 
 def _sums(statistics: Collection[KeyStatistics]) -> dict[str, int]:

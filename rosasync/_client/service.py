@@ -20,6 +20,7 @@ from rosasync._client.mismatch import MismatchReporter
 from rosasync._client.retry import Plan, RetryBudget
 from rosasync._core.aio import Deadlines, Expired, start_task
 from rosasync._core.ports import PortDestroyed
+from rosasync._core.text import count
 from rosasync.errors import ContextShutdown, RosasyncError
 from rosasync.statistics import KeyStatistics
 from rosasync.tracing import ClientTracing
@@ -86,7 +87,7 @@ class ServicePool:
 
     def __repr__(self) -> str:
         return (
-            f"<ServicePool {self.service.key.srv_name} {len(self._clients)} clients, "
+            f"<ServicePool {self.service.key.srv_name} {count(len(self._clients), 'client')}, "
             f"{self._counts.in_flight} in flight, {self._dispatch.waiting} waiting>"
         )
 

@@ -20,6 +20,7 @@ from rclpy.qos import QoSProfile
 from rclpy.waitable import NumberOfEntities, Waitable
 
 from rosasync._core.ports import Service
+from rosasync._core.text import count
 from rosasync._ros.endpoints import (
     Endpoint,
     gid_of,
@@ -172,8 +173,8 @@ class GraphQueries:
         if similar := describe_similar(services, srv_name, srv_type):
             return f"no server has this name; there are {similar}"
         return (
-            f"no server has this name or a similar one, among {len(services)} services of other "
-            "nodes: start the server, or compare its name and namespace"
+            f"no server has this name or a similar one, among {count(len(services), 'service')} of "
+            "other nodes: start the server, or compare its name and namespace"
         )
 
     def explain_mismatch(self, service: Service) -> str | None:

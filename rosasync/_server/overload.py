@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import logging
 
+from rosasync._core.text import count
+
 __all__ = ["OverloadLog"]
 
 logger = logging.getLogger("rosasync")
@@ -72,10 +74,10 @@ class OverloadLog:
         self._began = self._loop.time()
         self._dropped = 0
         logger.warning(
-            "%s: overloaded, with %d requests waiting, the oldest for %.1f s: %s. Raise "
+            "%s: overloaded, with %s waiting, the oldest for %.1f s: %s. Raise "
             "concurrency, make the handler faster, or answer what is dropped with on_overload",
             self._name,
-            waiting,
+            count(waiting, "request"),
             oldest_age,
             self._order,
         )
@@ -84,8 +86,8 @@ class OverloadLog:
         self._timer = None
         self.active = False
         logger.warning(
-            "%s: no longer overloaded, after %.1f s in which %d requests were dropped",
+            "%s: no longer overloaded, after %.1f s, with %s dropped",
             self._name,
             self._loop.time() - self._began,
-            self._dropped,
+            count(self._dropped, "request"),
         )

@@ -12,6 +12,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Generic, Literal, Self
 
 from rosasync._core.aio import until_done
+from rosasync._core.text import count
 from rosasync._server.backlog import Backlog
 from rosasync._server.counts import CallCounts
 from rosasync._server.handler_tasks import HandlerTasks
@@ -376,9 +377,9 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         waiting = self._intake.clear()
         if waiting:
             logger.warning(
-                "%s: closed with %d requests waiting, which are dropped unanswered",
+                "%s: closed with %s waiting, dropped unanswered",
                 self._name,
-                len(waiting),
+                count(len(waiting), "request"),
             )
         for call in waiting:
             call.give_up("dropped: the server was closed", Outcome.CLOSED)

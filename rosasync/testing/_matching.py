@@ -7,10 +7,11 @@ from collections.abc import Mapping, Sequence
 from pprint import pformat
 from typing import Any
 
+from rosasync._core.text import count
 from rosasync._ros.message_fields import field_types
 from rosasync._ros.types import type_name
 
-__all__ = ["check_fields", "count", "describe", "difference", "explain_mismatch", "matches"]
+__all__ = ["check_fields", "describe", "difference", "explain_mismatch", "matches"]
 
 
 def matches(expected: Any, actual: Any) -> bool:
@@ -88,8 +89,3 @@ def explain_mismatch(
         for fields, request in zip([*expected, *[{}] * len(requests)], requests, strict=False)
     ]
     return difference([dict(fields) for fields in expected], shown)
-
-
-def count(number: int, noun: str) -> str:
-    """Return a number with its noun, in the plural if needed."""
-    return f"{number} {noun}{'' if number == 1 else 's'}"

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 from rosasync._core.safe_yaml import YamlError, load, read_bytes
+from rosasync._core.text import count
 from rosasync._ros.messages import to_dict, to_message
 from rosasync._ros.types import service_type, type_name
 from rosasync.testing._hooks import GraphSession, Hooks
@@ -65,7 +66,7 @@ class Recording:
         self.calls: list[RecordedCall] = list(calls)
 
     def __repr__(self) -> str:
-        return f"<Recording {len(self.calls)} calls>"
+        return f"<Recording {count(len(self.calls), 'call')}>"
 
     # Recording.
 

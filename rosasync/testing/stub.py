@@ -7,13 +7,13 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mappin
 from contextlib import AbstractContextManager, contextmanager
 from typing import TYPE_CHECKING, Any, Generic, Self, TypeAlias
 
+from rosasync._core.text import count
 from rosasync._ros.messages import to_dict, to_message
 from rosasync._ros.types import service_type
 from rosasync.testing._arrivals import Arrivals
 from rosasync.testing._faults import Faults, FaultyService, StubCall, set_in_block
 from rosasync.testing._matching import (
     check_fields,
-    count,
     describe,
     difference,
     explain_mismatch,

@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Any, Generic, Self, TypeAlias
 from uuid import UUID
 
 from rosasync._actions.status import GoalStatus
+from rosasync._core.text import count
 from rosasync._ros.messages import make_message, to_dict
 from rosasync._ros.types import action_type
 from rosasync.errors import GoalAborted, GoalCanceled, GoalRejected, SessionClosed
 from rosasync.options import check_seconds
 from rosasync.testing._arrivals import Arrivals
 from rosasync.testing._faults import Faults, FaultyService, OpenService, StubCall, set_in_block
-from rosasync.testing._matching import count, describe, explain_mismatch
+from rosasync.testing._matching import describe, explain_mismatch
 from rosasync.testing._rules import Match, Rules
 from rosasync.typing import FeedbackT, GoalT, ResultT
 
