@@ -156,7 +156,7 @@ def clashes(servers: list[Endpoint], clients: list[Endpoint]) -> list[str]:
     if len(servers) > len(served):
         found.append(
             f"{len(servers)} servers: each request is run by every one of its type, and the first "
-            "response wins"
+            "response wins. After a crash, the dead one is shown for up to 20 s"
         )
     if served and called:
         found.append(f"called as {', '.join(called)}, but served as {', '.join(served)}")

@@ -98,8 +98,10 @@ class Matching:
         return not self._owner.any_ready() and not self.provided()
 
     def warn_of_several(self) -> None:
-        """Warn if there are more servers than ever."""
-        servers = len(self.servers)
+        """Warn if there are more servers than ever, without those that have crashed."""
+        if len(self.servers) <= self._most:
+            return
+        servers = len(self.servers - self._node.find_ended(self.servers))
         if servers > self._most:
             self._most = servers
             names = self._node.name_servers(self._service)

@@ -396,6 +396,15 @@ class NodePort(Protocol):
             ContextShutdown: the node is down.
         """
 
+    def find_ended(self, servers: Servers) -> Servers:
+        """Return those of these servers whose process has certainly ended without its clean-up.
+
+        The graph still shows them until their lease runs out.
+
+        Raises:
+            ContextShutdown: the node is down.
+        """
+
     def name_servers(self, service: Service) -> tuple[str, ...]:
         """Return the full names of the nodes that serve this name and type, as far as known.
 

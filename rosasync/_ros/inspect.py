@@ -24,8 +24,9 @@ from rosasync._ros.endpoints import (
     response_writers,
     servers_of,
 )
+from rosasync._ros.host import DISCOVERY_TOPIC
 from rosasync._ros.names import SEND_GOAL, default_qos
-from rosasync._ros.silence import DISCOVERY_TOPIC, explain_silence
+from rosasync._ros.silence import explain_silence
 
 __all__ = [
     "Endpoint",

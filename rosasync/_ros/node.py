@@ -27,6 +27,7 @@ from rosasync._core.ports import (
     DeliverMessage,
     DeliverRequest,
     PublisherPort,
+    Servers,
     Service,
     ServicePort,
     SubscriptionPort,
@@ -48,6 +49,7 @@ from rosasync._ros.failures import (
     uses_node,
 )
 from rosasync._ros.graph import GraphQueries, GraphWaitable
+from rosasync._ros.host import ended
 from rosasync._ros.identities import Identities
 from rosasync._ros.messages import make_message
 from rosasync._ros.shared_memory import check_ports
@@ -252,6 +254,11 @@ class RosNode:
     def find_servers(self, service: Service) -> frozenset[Hashable]:
         """Identify the servers that fit: by name, type and QoS."""
         return self._graph.find_servers(service)
+
+    def find_ended(self, servers: Servers) -> Servers:
+        """Return those of these servers whose process has certainly ended."""
+        with uses_node(self._node):
+            return ended(self._node, (gid for gid in servers if isinstance(gid, bytes)))
 
     def find_publishers(self, topic_name: str) -> frozenset[Hashable]:
         """Identify the publishers of a topic, in all processes."""

@@ -17,14 +17,9 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from rosasync._ros.endpoints import gid_of
 from rosasync._ros.fresh_ports import live_ports, own_ports
+from rosasync._ros.host import of_this_host, participants
 
-__all__ = ["DISCOVERY_TOPIC", "explain_silence"]
-
-HOST = 4
-"""Bytes at the start of a GUID that name the vendor and the host (RTPS 2.5, 9.3.1; Fast DDS)."""
-
-DISCOVERY_TOPIC = "ros_discovery_info"
-"""The topic on which each context announces its nodes: one writer for each participant."""
+__all__ = ["explain_silence"]
 
 SILENT = "the server is visible, but no data arrives from it"
 REMEDY = (
@@ -44,15 +39,10 @@ def explain_silence(node: Node, endpoints: Iterable[TopicEndpointInfo]) -> str |
     Returns:
         None if shared memory does not explain it.
     """
-    hosts = {gid_of(own)[:HOST] for own in _own(node)}
-    if not any(gid_of(endpoint)[:HOST] in hosts for endpoint in endpoints):
+    if not any(of_this_host(node, map(gid_of, endpoints))):
         return None
     ports = live_ports(int(node.context.get_domain_id()))
-    visible = sum(
-        gid_of(writer)[:HOST] in hosts
-        for writer in node.get_publishers_info_by_topic(DISCOVERY_TOPIC, no_mangle=True)
-    )
-    if visible > len(ports):
+    if len(participants(node)) > len(ports):
         return (
             f"{SILENT}: the two processes have no /dev/shm in common. Start both containers with "
             f"--ipc=host. {REMEDY}"
@@ -65,15 +55,6 @@ def explain_silence(node: Node, endpoints: Iterable[TopicEndpointInfo]) -> str |
                 f"write to each other's ports. Run both as one user. {REMEDY}"
             )
     return None
-
-
-def _own(node: Node) -> list[TopicEndpointInfo]:
-    """Return the endpoints of this node, whose beginning is that of every process of the host."""
-    return [
-        endpoint
-        for endpoint in node.get_publishers_info_by_topic("/parameter_events")
-        if endpoint.node_name == node.get_name() and endpoint.node_namespace == node.get_namespace()
-    ]
 
 
 def _name(user: int) -> str:

@@ -553,6 +553,22 @@ async def test_several_servers_of_one_name_are_warned_of_once(
     ]
 
 
+async def test_servers_that_have_crashed_do_not_count_as_several(
+    fake_graph: FakeGraph, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The graph shows one for some time after its end, when its successor is there already."""
+    first, _ = (fake_graph.serve(Echo, "/echo", echo) for _ in range(2))
+    crashed = frozenset({first.identity})
+    monkeypatch.setattr(MemoryNode, "find_ended", lambda node, servers: crashed & servers)
+    async with opened(fake_graph) as session:
+        with caplog.at_level(logging.WARNING, "rosasync"):
+            assert await ask(session, 1) == 1
+            assert caplog.messages == []
+            fake_graph.serve(Echo, "/echo", echo)
+            assert await ask(session, 2) == 2
+    assert [message.partition(" answer")[0] for message in caplog.messages] == ["/echo: 2 servers"]
+
+
 async def test_a_storm_leaves_nothing(fake_graph: FakeGraph) -> None:
     """Calls that are cancelled or time out at random do not cause others to be lost."""
     dice = random.Random(1)

@@ -225,6 +225,10 @@ class MemoryNode:
             for server in self.graph.find(service.key.srv_type, service.key.srv_name)
         )
 
+    def find_ended(self, servers: frozenset[Hashable]) -> frozenset[Hashable]:
+        """Return none of these servers: in memory, one that ends leaves the graph."""
+        return frozenset()
+
     def name_servers(self, service: Service) -> tuple[str, ...]:
         """Return a name for each server: in memory, servers need no node."""
         servers = self.graph.find(service.key.srv_type, service.key.srv_name)

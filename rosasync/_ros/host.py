@@ -1,0 +1,75 @@
+"""What of the graph belongs to this host, and which of its processes have ended.
+
+The GUIDs of Fast DDS begin with its vendor, the host, and the lower half of the process id. After a
+crash, the graph shows a process until its lease runs out.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+
+from rclpy.node import Node
+from rclpy.utilities import get_rmw_implementation_identifier
+
+from rosasync._ros.discovery import ports_of, udp_sockets
+from rosasync._ros.endpoints import GUID_PREFIX, gid_of
+
+__all__ = ["DISCOVERY_TOPIC", "ended", "of_this_host", "participants"]
+
+HOST = 4
+"""Bytes at the start of a GUID that name the vendor and the host (RTPS 2.5, 9.3.1; Fast DDS)."""
+
+PROCESS = slice(4, 6)
+"""The bytes of a GUID with the lower half of the process id, the lowest first (Fast DDS)."""
+
+DISCOVERY_TOPIC = "ros_discovery_info"
+"""The topic on which each context announces its nodes: one writer for each participant."""
+
+
+def of_this_host(node: Node, gids: Iterable[bytes]) -> list[bytes]:
+    """Return the GUIDs of this host's processes.
+
+    Args:
+        node: a node of this process, whose own endpoints show how they begin.
+        gids: the GUIDs of any endpoints.
+    """
+    own = {
+        gid_of(endpoint)[:HOST]
+        for endpoint in node.get_publishers_info_by_topic("/parameter_events")
+        if endpoint.node_name == node.get_name() and endpoint.node_namespace == node.get_namespace()
+    }
+    return [gid for gid in gids if gid[:HOST] in own]
+
+
+def participants(node: Node) -> list[bytes]:
+    """Return a GUID of each participant of this host that the graph shows."""
+    writers = node.get_publishers_info_by_topic(DISCOVERY_TOPIC, no_mangle=True)
+    return of_this_host(node, map(gid_of, writers))
+
+
+def ended(node: Node, gids: Iterable[bytes]) -> frozenset[bytes]:
+    """Return the GUIDs whose process has certainly ended.
+
+    Two signs have to agree. There is no process with this id: but in another container it may have
+    another one. And the graph shows more participants than have a socket here: those of a container
+    that shares this host's network have one.
+
+    Args:
+        node: a node of this process.
+        gids: the GUIDs of any endpoints.
+    """
+    if "fastrtps" not in get_rmw_implementation_identifier():
+        return frozenset()
+    alive = {int(name) & 0xFFFF for name in os.listdir("/proc") if name.isdecimal()}
+    missing = [gid for gid in of_this_host(node, gids) if _process_of(gid) not in alive]
+    if not missing:
+        return frozenset()
+    sockets = {port for port, _ in udp_sockets()} & {*ports_of(int(node.context.get_domain_id()))}
+    surplus = len(participants(node)) - len(sockets)
+    lost = {gid[:GUID_PREFIX] for gid in missing}
+    return frozenset(missing if sockets and surplus >= len(lost) else ())
+
+
+def _process_of(gid: bytes) -> int:
+    return int.from_bytes(gid[PROCESS], "little")
