@@ -26,6 +26,10 @@ async def test_unserved(ros_graph):
         with pytest.raises(ServiceUnavailable):
             await session.call(SetBool, "/arm", wait=False)
 
+async def test_failed(ros_graph):
+    ros_graph.stub(SetBool, "/arm", {})
+    assert False, "what is wrong"
+
 @pytest.mark.rosasync(strict=False)
 async def test_lenient(ros_graph):
     ros_graph.stub(SetBool, "/arm", {})
@@ -105,7 +109,7 @@ def test_the_examples_of_the_page(project: Path, kind: str) -> None:
 def test_strictness(project: Path) -> None:
     (project / "test_strict.py").write_text(STRICT)
     output = run(project)
-    assert "3 passed, 2 errors" in output
+    assert "1 failed, 3 passed, 2 errors" in output
     assert "/arm was never called" in output
     assert "/arm (std_srvs/srv/SetBool) was called, and has no server" in output
 

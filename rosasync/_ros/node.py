@@ -17,6 +17,7 @@ from rclpy.qos import QoSProfile, qos_profile_system_default
 from rclpy.serialization import deserialize_message
 from rclpy.service_introspection import ServiceIntrospectionState
 from rclpy.signals import SignalHandlerOptions
+from rclpy.validate_node_name import validate_node_name
 
 from rosasync._core.fork import check_fork, forked, note_use, refuse
 from rosasync._core.gateway import LoopGateway
@@ -359,6 +360,8 @@ class RosNode:
                 "rclpy.init(context=context) first, or leave it out"
             )
         try:
+            # Here, and not only in `Node`, whose failure prints warnings about what it had made.
+            validate_node_name(node)
             self._own_node = self._make_own(node, context)
         except InvalidNodeNameException as error:
             reason = names.reason_of_name(error)

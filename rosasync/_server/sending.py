@@ -285,4 +285,6 @@ def service_destroyed(name: str) -> ContextShutdown:
 
 
 def _name_of(kind: type) -> str:
-    return f"{kind.__module__}.{kind.__qualname__}"
+    """Return the name by which a class is imported, without the private modules of a message."""
+    parts = [part for part in kind.__module__.split(".") if not part.startswith("_")]
+    return ".".join([*(part for part in parts if part != "builtins"), kind.__qualname__])
