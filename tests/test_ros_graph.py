@@ -98,7 +98,7 @@ class TestServers:
     async def test_placeholders_if_the_topics_have_other_names(
         self, opened: Opened, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(graph, "response_writers", lambda *_: [])
+        monkeypatch.setattr(endpoints, "response_writers", lambda *_: [])
         with borrowed_node() as lender:
             for _ in range(2):
                 lender.create_service(AddDiagnostics, "/echo", nothing)

@@ -70,9 +70,12 @@ async def _doctor(as_json: bool) -> int:
     report.add("python", True, f"{platform.python_version()}, {sys.executable}")
     if _rclpy(report) and _middleware(report):
         environment(report)
-        _shared_memory(report)
+        fast_dds = _is_fast_dds()
+        if fast_dds:
+            _shared_memory(report)
         _multicast(report)
-        _profile(report)
+        if fast_dds:
+            _profile(report)
         if "domain" not in report.failed and _ports(report):
             await _calls(report)
     return Code.FAILED if report.failed else Code.ANSWERED
@@ -103,6 +106,12 @@ def _middleware(report: Report) -> bool:
     return True
 
 
+def _is_fast_dds() -> bool:
+    from rosasync._ros import fastdds
+
+    return fastdds.is_present()
+
+
 def _shared_memory(report: Report) -> None:
     """Check that Fast DDS can use shared memory; without it, it falls back to UDP."""
     usable = os.access(FOLDER, os.W_OK | os.X_OK)
@@ -119,9 +128,7 @@ def _shared_memory(report: Report) -> None:
 
 def _ports(report: Report) -> bool:
     """Check the ports in shared memory; return whether a new node can be created."""
-    from rosasync._ros.inspect import middleware
-
-    if "fastrtps" not in middleware():
+    if not _is_fast_dds():
         return True
     domain = environment_domain()
     left = unfinished_ports(domain)

@@ -1,7 +1,10 @@
-"""The DDS endpoints of a service, as the graph shows them.
+"""The endpoints of a service, as the graph shows them.
 
-rmw makes two topics of a service (https://design.ros2.org/articles/topic_and_service_names.html):
-the clients write requests to one, and the server writes responses to the other.
+A middleware of DDS makes two topics of a service
+(https://design.ros2.org/articles/topic_and_service_names.html): the clients write requests to one,
+and the server writes responses to the other. Zenoh has no such topics. There, rclpy's own query for
+the servers of a service is used, if this rclpy has it and the middleware answers it (Lyrical).
+Without either, the nodes are asked for the services that they have, which identifies no server.
 """
 
 from __future__ import annotations
@@ -31,6 +34,7 @@ __all__ = [
     "compatible",
     "full_name",
     "gid_of",
+    "identified_servers",
     "incompatibility",
     "prefixes",
     "request_writers",
@@ -46,6 +50,9 @@ GUID_PREFIX = 12
 REQUEST, RESPONSE = "_Request_", "_Response_"
 """The ends of the names of the DDS types of a service."""
 
+READER, WRITER = 0, -1
+"""The places of an endpoint's reader and writer in what rclpy lists of a service."""
+
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
@@ -55,25 +62,36 @@ class Endpoint:
         node: the full name of its node, ``""`` while that is unknown.
         srv_type: the name of its service type, ``""`` while that is unknown.
         qos: its QoS; None if the middleware does not tell.
+        gid: its GUID, of the writer or reader of responses; None if the middleware does not tell.
     """
 
     node: str
     srv_type: str
     qos: QoSProfile | None
+    gid: bytes | None = None
 
 
 def servers_of(node: Node, srv_name: str) -> list[Endpoint]:
     """Return the servers of a resolved name."""
+    return identified_servers(node, srv_name) or _by_node(
+        node, srv_name, node.get_service_names_and_types_by_node
+    )
+
+
+def identified_servers(node: Node, srv_name: str) -> list[Endpoint]:
+    """Return the servers of a resolved name; none if the middleware does not identify them."""
     if found := response_writers(node, srv_name):
         return [_endpoint(writer, RESPONSE) for writer in found]
-    return _by_node(node, srv_name, node.get_service_names_and_types_by_node)
+    return _asked(node, "get_servers_info_by_service", srv_name, WRITER)
 
 
 def clients_of(node: Node, srv_name: str) -> list[Endpoint]:
     """Return the clients of a resolved name, including those of the node itself."""
     if found := request_writers(node, srv_name):
         return [_endpoint(writer, REQUEST) for writer in found]
-    return _by_node(node, srv_name, node.get_client_names_and_types_by_node)
+    return _asked(node, "get_clients_info_by_service", srv_name, READER) or _by_node(
+        node, srv_name, node.get_client_names_and_types_by_node
+    )
 
 
 def full_name(name: str, namespace: str) -> str:
@@ -101,15 +119,13 @@ def gid_of(endpoint: TopicEndpointInfo) -> bytes:
     return bytes(endpoint.endpoint_gid)
 
 
-def serves(writer: TopicEndpointInfo, service: Service, qos: QoSProfile) -> bool:
-    """Return whether this response writer's server fits, by type and QoS.
+def serves(server: Endpoint, service: Service, qos: QoSProfile) -> bool:
+    """Return whether a server fits, by type and QoS.
 
     A service has the same QoS for its requests as for its responses.
     """
-    return bool(
-        _srv_type(writer.topic_type, RESPONSE) == service.key.srv_type
-        and compatible(writer.qos_profile, qos)
-        and compatible(qos, writer.qos_profile)
+    return server.srv_type == service.key.srv_type and (
+        server.qos is None or (compatible(server.qos, qos) and compatible(qos, server.qos))
     )
 
 
@@ -131,13 +147,39 @@ def prefixes(endpoints: Iterable[TopicEndpointInfo]) -> list[bytes]:
 
 def _endpoint(info: TopicEndpointInfo, suffix: str) -> Endpoint:
     name = "" if "UNKNOWN" in info.node_name else full_name(info.node_name, info.node_namespace)
-    return Endpoint(name, _srv_type(info.topic_type, suffix), info.qos_profile)
+    return Endpoint(name, _srv_type(info.topic_type, suffix), info.qos_profile, gid_of(info))
 
 
 def _srv_type(topic_type: str, suffix: str) -> str:
     """Return ``std_srvs/srv/SetBool`` for ``std_srvs::srv::dds_::SetBool_Response_``."""
     parts = topic_type.removesuffix(suffix).split("::")
     return "/".join(part for part in parts if part != "dds_")
+
+
+def _asked(node: Node, query: str, srv_name: str, which: int) -> list[Endpoint]:
+    """Ask rclpy for the endpoints of a service.
+
+    Args:
+        node: the node that asks.
+        query: the name of its method, which rclpy has from 10.0.2 on.
+        srv_name: the resolved name.
+        which: the one of the two GUIDs and QoS that counts. Zenoh has only one of each.
+    """
+    if (ask := getattr(node, query, None)) is None:
+        return []
+    try:
+        found = ask(srv_name)
+    except NotImplementedError:  # by this middleware
+        return []
+    return [
+        Endpoint(
+            full_name(info.node_name, info.node_namespace),
+            info.service_type,
+            info.qos_profiles[which],
+            bytes(info.endpoint_gids[which]),
+        )
+        for info in found
+    ]
 
 
 def _by_node(node: Node, srv_name: str, query: Callable[..., Any]) -> list[Endpoint]:

@@ -1,4 +1,7 @@
-"""The functions of Fast DDS that neither rcl nor rclpy offers, through ctypes."""
+"""The functions of Fast DDS that neither rcl nor rclpy offers, through ctypes.
+
+Whether the middleware is Fast DDS is decided by what its library offers, not by its name.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +11,11 @@ from typing import Any
 
 from rclpy.utilities import get_rmw_implementation_identifier
 
-__all__ = ["acknowledged", "load_profiles"]
+__all__ = ["acknowledged", "is_present", "load_profiles"]
 
-RMW = "rmw_fastrtps_cpp"
-RESPONSE_WRITER = "_ZN16rmw_fastrtps_cpp23get_response_datawriterEP13rmw_service_s"
+RESPONSE_WRITER = "_ZN{length}{rmw}23get_response_datawriterEP13rmw_service_s"
 """``rmw_fastrtps_cpp::get_response_datawriter(rmw_service_t *)`` (rmw_fastrtps_cpp/get_service.hpp)
-returns null for a service of another middleware."""
+and its like in the namespace of another middleware of Fast DDS."""
 WAITS = (
     "_ZN8eprosima7fastdds3dds10DataWriter24wait_for_acknowledgmentsERKNS_8fastrtps6Time_tE",
     "_ZN8eprosima7fastdds3dds10DataWriter24wait_for_acknowledgmentsERKNS1_6Time_tE",
@@ -42,8 +44,9 @@ class Acknowledgements:
 
     def __init__(self) -> None:
         self._rmw_service = ctypes.CDLL("librcl.so").rcl_service_get_rmw_handle
-        rmw = ctypes.CDLL(f"lib{RMW}.so")
-        self._writer = getattr(rmw, RESPONSE_WRITER)
+        name = get_rmw_implementation_identifier()
+        rmw = ctypes.CDLL(f"lib{name}.so")
+        self._writer = getattr(rmw, RESPONSE_WRITER.format(length=len(name), rmw=name))
         # The symbols of the libraries that it is linked with are found too.
         (self._wait,) = (getattr(rmw, name) for name in WAITS if hasattr(rmw, name))
         for function in (self._rmw_service, self._writer):
@@ -120,6 +123,15 @@ def load_profiles(text: str) -> bool:
 
 
 @cache
+def is_present() -> bool:
+    """Return whether this middleware is Fast DDS: whether its library has the factory."""
+    try:
+        return hasattr(ctypes.CDLL(f"lib{get_rmw_implementation_identifier()}.so"), GET_FACTORY)
+    except OSError:
+        return False
+
+
+@cache
 def _load_profiles() -> Profiles | None:
     try:
         return Profiles()
@@ -129,8 +141,6 @@ def _load_profiles() -> Profiles | None:
 
 @cache
 def _load() -> Acknowledgements | None:
-    if get_rmw_implementation_identifier() != RMW:
-        return None
     try:
         return Acknowledgements()
     except (OSError, AttributeError, ValueError):

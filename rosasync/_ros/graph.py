@@ -23,7 +23,7 @@ from rosasync._core.ports import Service
 from rosasync._core.text import count
 from rosasync._ros.endpoints import (
     Endpoint,
-    gid_of,
+    identified_servers,
     incompatibility,
     response_writers,
     servers_of,
@@ -145,10 +145,9 @@ class GraphQueries:
         """Identify the servers that fit; see `rosasync._core.ports.NodePort.find_servers`."""
         name, srv_type, _ = service.key
         with uses_node(self._node):
-            if writers := response_writers(self._node, name):
+            if found := identified_servers(self._node, name):
                 qos = service.qos or default_qos()
-                return frozenset(gid_of(w) for w in writers if serves(w, service, qos))
-            # Another middleware than Fast DDS may name the topics otherwise.
+                return frozenset(s.gid for s in found if serves(s, service, qos))
             servers = self._count_servers(name)
             if servers and srv_type in self._services().get(name, ()):
                 return frozenset(range(servers))

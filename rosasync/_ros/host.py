@@ -10,8 +10,8 @@ import os
 from collections.abc import Iterable
 
 from rclpy.node import Node
-from rclpy.utilities import get_rmw_implementation_identifier
 
+from rosasync._ros import fastdds
 from rosasync._ros.discovery import ports_of, udp_sockets
 from rosasync._ros.endpoints import GUID_PREFIX, gid_of
 
@@ -59,7 +59,7 @@ def ended(node: Node, gids: Iterable[bytes]) -> frozenset[bytes]:
         node: a node of this process.
         gids: the GUIDs of any endpoints.
     """
-    if "fastrtps" not in get_rmw_implementation_identifier():
+    if not fastdds.is_present():
         return frozenset()
     alive = {int(name) & 0xFFFF for name in os.listdir("/proc") if name.isdecimal()}
     missing = [gid for gid in of_this_host(node, gids) if _process_of(gid) not in alive]

@@ -34,7 +34,7 @@ from rosasync._core.ports import (
     SubscriptionPort,
     TopicQos,
 )
-from rosasync._ros import configuration, discovery, names, profile, rcl
+from rosasync._ros import configuration, discovery, fastdds, names, profile, rcl
 from rosasync._ros.direct_bridge import DirectBridge
 from rosasync._ros.domain import check_domain, environment_domain
 from rosasync._ros.endpoints import gid_of, response_readers, response_writers
@@ -180,7 +180,9 @@ class RosNode:
                 _qos_of(service, self._client_depth(service)),
                 deliver,
             )
-            client.identity = created()
+            client.identity = self._identities.confirm(
+                client.handle, service.key.srv_name, created()
+            )
         except RclpyError as error:
             raise refusal(self._node, service, "client", error) from error
         return client
@@ -381,7 +383,7 @@ class RosNode:
             environment_domain()
             context = self._own_context = Context()
             rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
-        if "fastrtps" not in rclpy.get_rmw_implementation_identifier():
+        if not fastdds.is_present():
             return Node(name, context=context)
         domain = context.get_domain_id()
         check_domain(domain)

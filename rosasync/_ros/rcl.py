@@ -9,8 +9,9 @@ from functools import cache
 from typing import Any
 
 from rclpy.exceptions import InvalidHandle
+from rclpy.utilities import get_rmw_implementation_identifier
 
-__all__ = ["Rcl", "load"]
+__all__ = ["Rcl", "client_gid", "load"]
 
 
 class Rcl:
@@ -89,6 +90,41 @@ def _set_callback(function: Any, handle: Any, signal: Any, fd: int | None) -> bo
             return all(function(*arguments) == 0 for _ in range(2))
     except InvalidHandle:
         return False
+
+
+class _Gid(ctypes.Structure):
+    """``rmw_gid_t``."""
+
+    _fields_ = (("middleware", ctypes.c_char_p), ("data", ctypes.c_uint8 * 16))
+
+
+def client_gid(client: Any) -> bytes | None:
+    """Return the GID that the middleware gives a client, None if it cannot be asked.
+
+    Args:
+        client: the handle of an rclpy client.
+    """
+    functions = _load_gids()
+    if functions is None:
+        return None
+    get_handle, get_gid = functions
+    gid = _Gid()
+    with client:
+        failed = get_gid(get_handle(client.pointer), ctypes.byref(gid))
+    return None if failed else bytes(gid.data)
+
+
+@cache
+def _load_gids() -> tuple[Any, Any] | None:
+    try:
+        get_handle = ctypes.CDLL("librcl.so").rcl_client_get_rmw_handle
+        rmw = ctypes.CDLL(f"lib{get_rmw_implementation_identifier()}.so")
+        get_gid = rmw.rmw_get_gid_for_client
+    except (OSError, AttributeError):
+        return None
+    get_handle.argtypes, get_handle.restype = [ctypes.c_void_p], ctypes.c_void_p
+    get_gid.argtypes = [ctypes.c_void_p, ctypes.POINTER(_Gid)]
+    return get_handle, get_gid
 
 
 @cache

@@ -11,13 +11,14 @@ from collections import Counter
 from collections.abc import Hashable
 from dataclasses import dataclass
 from time import monotonic
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeGuard
 
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.service import Service
 
 from rosasync._core.ports import RequestHeader, Undeliverable, Unmatched
+from rosasync._ros import fastdds
 from rosasync._ros.checks import checker
 from rosasync._ros.endpoints import (
     GUID_PREFIX,
@@ -85,6 +86,9 @@ class ClientGraph:
         self._poll_at = 0.0
         self.readers: dict[bytes, QoSProfile] = {}
         self.writers: Counter[bytes] = Counter()
+        # Whether requests name their client by a GUID of the graph, as far as known. Those of
+        # Cyclone DDS have a number of its own.
+        self._uses_guids = fastdds.is_present()
 
     def refresh(self, now: float) -> bool:
         """Query the graph if it is time, and return whether it was."""
@@ -101,6 +105,13 @@ class ClientGraph:
     def empty(self) -> bool:
         """Whether no client is visible: all have left, or the middleware names topics otherwise."""
         return not self.readers and not self.writers
+
+    def identifies(self, client: bytes | None) -> TypeGuard[bytes]:
+        """Return whether the graph would show the client of a request by this identity."""
+        if client is None:
+            return False
+        self._uses_guids = self._uses_guids or self.has_process(client)
+        return self._uses_guids
 
     def has_process(self, guid: bytes) -> bool:
         """Return whether the process of this reader still has a client of the service."""
@@ -217,10 +228,10 @@ class Responder:
     def _check_visible(self, header: RequestHeader) -> None:
         """Raise if the graph does not show the client: the middleware dropped the response."""
         guid = client_of(header)
-        if guid is None:
-            return
         self._graph.refresh(monotonic())
-        if guid not in self._graph.readers and not self._graph.empty:
+        if not self._graph.identifies(guid) or self._graph.empty:
+            return
+        if guid not in self._graph.readers:
             self._fail(header, NOT_MATCHED)
 
     def _fail(self, header: RequestHeader, reason: str) -> NoReturn:
@@ -229,7 +240,8 @@ class Responder:
         self._watch_until = now + WATCH_TIME
         self._watching = True
         guid = client_of(header)
-        if guid is None:
+        self._graph.refresh(now)
+        if not self._graph.identifies(guid):
             raise Unmatched(reason)
         known = self._unreached.get(guid)
         if known is None:
@@ -239,7 +251,6 @@ class Responder:
         else:
             known.failures += 1
             known.due = None
-        self._graph.refresh(now)
         self._check_qos(guid)
         raise Unmatched(reason)
 
@@ -255,18 +266,17 @@ class Responder:
             self._watching = False
             return None
         guid = client_of(header)
-        if guid is None:
-            self._check_all(now, watching)
-        elif watching or guid in self._unreached:
-            self._refresh(now)
+        if not watching and guid not in self._unreached:
+            return None
+        self._refresh(now)
+        if self._graph.identifies(guid):
             self._check_client(guid, now)
+        else:
+            self._check_all()
         return guid if guid in self._unreached else None
 
-    def _check_all(self, now: float, watching: bool) -> None:
-        """Raise while the graph shows any client that a send might wait for."""
-        if not watching:
-            return
-        self._refresh(now)
+    def _check_all(self) -> None:
+        """Raise if the graph shows any client that a send might wait for."""
         if self._graph.half_known() or any(map(self._check_reader, self._graph.readers.values())):
             raise Unmatched("a client of the service is not matched")
 

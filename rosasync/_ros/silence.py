@@ -15,6 +15,7 @@ from collections.abc import Iterable
 from rclpy.node import Node
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
+from rosasync._ros import fastdds
 from rosasync._ros.endpoints import gid_of
 from rosasync._ros.fresh_ports import live_ports, own_ports
 from rosasync._ros.host import of_this_host, participants
@@ -37,8 +38,10 @@ def explain_silence(node: Node, endpoints: Iterable[TopicEndpointInfo]) -> str |
             too, so something has arrived from all others.
 
     Returns:
-        None if shared memory does not explain it.
+        None if shared memory does not explain it, or another middleware than Fast DDS is in use.
     """
+    if not fastdds.is_present():
+        return None
     if not any(of_this_host(node, map(gid_of, endpoints))):
         return None
     ports = live_ports(int(node.context.get_domain_id()))
