@@ -114,7 +114,9 @@ class TestCall:
     async def test_of_the_wrong_type(self, session: Session, holder: Holder, wrong: Any) -> None:
         task = ask(session, "/held", "text")
         (call,) = await holder.held(1)
-        with pytest.raises(TypeError, match="AddDiagnostics_Response"):
+        with pytest.raises(
+            TypeError, match=r"is a diagnostic_msgs\.srv\.AddDiagnostics_Response, or"
+        ):
             call.respond(wrong)
         assert not call.responded
         call.respond(echo_of(call.request))
