@@ -460,12 +460,14 @@ class TestRetry:
     async def test_the_first_answer_wins_and_the_second_is_late(
         self, fake_graph: FakeGraph
     ) -> None:
-        fake_graph.serve(Echo, "/echo", echo)
+        server = fake_graph.serve(Echo, "/echo", echo)
         async with opened(fake_graph) as session:
             await ask(session, 0)
-            with fake_graph.delay_responses(3 * TICK):
-                task = asyncio.create_task(ask(session, 1, retry=Retry(after=2 * TICK)))
-                await until(lambda: session.pool.statistics().retried == 1)
+            with fake_graph.delay_responses(20 * TICK):
+                task = asyncio.create_task(ask(session, 1, retry=Retry(2, 5 * TICK)))
+                await until(lambda: len(server.received) == 2)
+            with fake_graph.delay_responses(40 * TICK):
+                await until(lambda: len(server.received) == 3)
             assert await task == 1
             assert session.pool.statistics().abandoned == 1
             await until(lambda: session.pool.statistics().late == 1)
