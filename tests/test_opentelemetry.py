@@ -203,7 +203,7 @@ class TestSpans:
 
             def heard() -> bool:
                 pool.match()
-                return listener.hears(node.find_servers(pool.service))
+                return listener.hears(node.queries.find_servers(pool.service))
 
             await until(heard)
             with pytest.raises(HandlerFailed):

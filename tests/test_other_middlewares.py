@@ -23,7 +23,7 @@ from rosasync._ros.identities import Identities
 from rosasync._ros.names import default_qos
 from rosasync._ros.responder import Responder
 from rosasync.statistics import ServiceKey
-from rosasync.testing._memory.graph import MemoryNode
+from rosasync.testing._memory.graph import MemoryQueries
 from tests.support.echo import ECHO, answer_to, request_of, response_to, service_class
 from tests.support.fake_graph import FakeGraph
 from tests.support.times import until
@@ -258,10 +258,10 @@ def test_fast_dds_is_recognised() -> None:
 def placeholders(fake_graph: FakeGraph, monkeypatch: pytest.MonkeyPatch) -> FakeGraph:
     """A graph that counts servers and identifies none."""
 
-    def counted(node: MemoryNode, service: Service) -> frozenset[int]:
-        return frozenset(range(node.count_servers(service)))
+    def counted(queries: MemoryQueries, service: Service) -> frozenset[int]:
+        return frozenset(range(queries.count_servers(service)))
 
-    monkeypatch.setattr(MemoryNode, "find_servers", counted)
+    monkeypatch.setattr(MemoryQueries, "find_servers", counted)
     return fake_graph
 
 

@@ -48,7 +48,7 @@ class World:
         return self.node.open_client(self.node.describe(ECHO, srv_name, None), self._deliver)
 
     def servers(self, srv_type: str = ECHO) -> int:
-        return len(self.node.find_servers(self.node.describe(srv_type, "/port_echo", None)))
+        return len(self.node.queries.find_servers(self.node.describe(srv_type, "/port_echo", None)))
 
     def _deliver(self, sequence_number: int, response: Any) -> None:
         self.responses.append((sequence_number, answer_to(response)))
@@ -88,7 +88,7 @@ async def world(request: pytest.FixtureRequest) -> AsyncIterator[World]:
     real = world.node = RosNode(options, gateway, world.changed, lambda: None)
     yield world
     real.stop()
-    await real.stopped()
+    await real.wait_stopped()
     assert real.join()
     gateway.close()
     real.close()
@@ -188,7 +188,7 @@ async def test_what_is_seen_instead(world: World) -> None:
     missing = world.node.describe(ECHO, "/port_ecco", None)
     await world.serve("/port_echo")
     await until(world.servers)
-    assert "/port_echo" in world.node.explain_missing(missing)
+    assert "/port_echo" in world.node.queries.explain_missing(missing)
     assert world.node.ok()
 
 
@@ -335,7 +335,7 @@ async def test_a_server_knows_its_clients_by_their_identities(world: World) -> N
         taken.clear()
     assert port.clients() >= {client.identity for client in clients}
     assert len({client.identity for client in clients}) == 3
-    assert world.node.find_servers(service) == {port.identity}
+    assert world.node.queries.find_servers(service) == {port.identity}
     for client in clients:
         client.close()
     await until(lambda: not port.clients() & {client.identity for client in clients})
@@ -355,11 +355,11 @@ async def test_clients_and_servers_of_a_node_are_of_one_process(world: World) ->
 
 async def test_publishers_are_identified(world: World) -> None:
     client = world.client()
-    assert world.node.find_publishers("/port_topic") == frozenset()
+    assert world.node.queries.find_publishers("/port_topic") == frozenset()
     publisher = world.node.open_publisher(GoalStatusArray, "/port_topic", TopicQos())
-    await until(lambda: world.node.find_publishers("/port_topic"))
-    (found,) = world.node.find_publishers("/port_topic")
+    await until(lambda: world.node.queries.find_publishers("/port_topic"))
+    (found,) = world.node.queries.find_publishers("/port_topic")
     assert process_of(found) == process_of(client.identity) is not None
     publisher.close()
-    await until(lambda: not world.node.find_publishers("/port_topic"))
+    await until(lambda: not world.node.queries.find_publishers("/port_topic"))
     client.close()

@@ -64,8 +64,8 @@ async def test_a_node_that_is_down(bridge: Bridge, end: Ending) -> None:
             await until(lambda: refuses(client.send, request_of("after")))
             uses: list[Callable[[], object]] = [
                 lambda: ros.describe(ECHO, "/echo", None),
-                lambda: ros.find_servers(service),
-                lambda: ros.explain_missing(service),
+                lambda: ros.queries.find_servers(service),
+                lambda: ros.queries.explain_missing(service),
                 lambda: opened.ros.open_client(service, lambda *_: None),
                 lambda: opened.ros.open_service(service, lambda *_: None),
                 lambda: client.send(request_of("after")),
@@ -337,7 +337,7 @@ class TestOutOfDescriptors:
 
     async def test_an_eventfd_that_cannot_be_watched(self, monkeypatch: pytest.MonkeyPatch) -> None:
         async with open_node("direct") as opened:
-            loop = opened.ros._loop
+            loop = asyncio.get_running_loop()
 
             def refusing(*_: Any) -> None:
                 raise OSError(errno.ENOSPC, "epoll")

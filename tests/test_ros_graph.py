@@ -13,7 +13,7 @@ from rclpy.duration import Duration
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from std_srvs.srv import SetBool, Trigger
 
-from rosasync._ros import endpoints, graph, node
+from rosasync._ros import bridges, endpoints, graph
 from rosasync._ros.endpoints import gid_of, incompatibility, response_writers
 from rosasync._ros.graph import GraphQueries, GraphWaitable
 from rosasync.errors import UsageError
@@ -49,22 +49,22 @@ class TestServers:
 
     async def test_they_are_told_apart_by_their_response_writers(self, opened: Opened) -> None:
         service = opened.service()
-        assert opened.ros.find_servers(service) == frozenset()
+        assert opened.queries.find_servers(service) == frozenset()
         with borrowed_node() as lender:
             servers = [lender.create_service(AddDiagnostics, "/echo", nothing) for _ in range(2)]
-            await until(lambda: len(opened.ros.find_servers(service)) == 2)
+            await until(lambda: len(opened.queries.find_servers(service)) == 2)
             gids = {gid_of(writer) for writer in response_writers(lender, "/echo")}
-            assert opened.ros.find_servers(service) == gids
+            assert opened.queries.find_servers(service) == gids
             lender.destroy_service(servers[0])
-            await until(lambda: len(opened.ros.find_servers(service)) == 1)
-            assert opened.ros.find_servers(service) < gids
+            await until(lambda: len(opened.queries.find_servers(service)) == 1)
+            assert opened.queries.find_servers(service) < gids
 
     async def test_those_of_another_type_do_not_count(self, opened: Opened) -> None:
         with borrowed_node() as lender:
             lender.create_service(Trigger, "/echo", nothing)
             await until(lambda: opened.ros.node.count_services("/echo"))
-            assert opened.ros.find_servers(opened.service(srv_type=Trigger))
-            assert not opened.ros.find_servers(opened.service())
+            assert opened.queries.find_servers(opened.service(srv_type=Trigger))
+            assert not opened.queries.find_servers(opened.service())
 
     @pytest.mark.parametrize(
         ("served", "asked", "fits"),
@@ -89,7 +89,7 @@ class TestServers:
             options = {} if served is None else {"qos_profile": served}
             lender.create_service(AddDiagnostics, "/echo", nothing, **options)
             await until(lambda: opened.ros.node.count_services("/echo"))
-            assert bool(opened.ros.find_servers(opened.service(qos=asked))) == fits
+            assert bool(opened.queries.find_servers(opened.service(qos=asked))) == fits
             client = opened.client(qos=asked)
             lender.create_service(AddDiagnostics, "/witness", nothing)
             await until(opened.client("/witness").ready)
@@ -103,8 +103,8 @@ class TestServers:
             for _ in range(2):
                 lender.create_service(AddDiagnostics, "/echo", nothing)
             await until(lambda: opened.ros.node.count_services("/echo") == 2)
-            assert opened.ros.find_servers(opened.service()) == {0, 1}
-            assert not opened.ros.find_servers(opened.service(srv_type=Trigger))
+            assert opened.queries.find_servers(opened.service()) == {0, 1}
+            assert not opened.queries.find_servers(opened.service(srv_type=Trigger))
 
     def test_unset_values_are_not_incompatible(self) -> None:
         assert incompatibility(QoSProfile(depth=10), QoSProfile(depth=1)) is None
@@ -149,10 +149,10 @@ class TestMissing:
 
     async def test_a_change_of_the_graph_is_in_the_next_answer(self, opened: Opened) -> None:
         missing = opened.service("/ecco")
-        opened.ros.explain_missing(missing)
+        opened.queries.explain_missing(missing)
         with borrowed_node() as lender:
             lender.create_service(AddDiagnostics, "/echo", nothing)
-            await until(lambda: "/echo" in opened.ros.explain_missing(missing))
+            await until(lambda: "/echo" in opened.queries.explain_missing(missing))
 
     async def test_no_other_node(self, lonely: Opened) -> None:
         missing = lonely.service("/ecco")
@@ -161,12 +161,12 @@ class TestMissing:
             f"no other node is visible in domain {domain} with discovery range LOCALHOST and "
             f"{rclpy.get_rmw_implementation_identifier()}: start the server, or compare its ROS_DOM"
         )
-        assert expected in lonely.ros.explain_missing(missing)
+        assert expected in lonely.queries.explain_missing(missing)
         lonely.serve("/own")
         await until(lambda: lonely.ros.node.count_services("/own"))
-        assert expected in lonely.ros.explain_missing(missing)
+        assert expected in lonely.queries.explain_missing(missing)
         with borrowed_node():
-            await until(lambda: "no other node" not in lonely.ros.explain_missing(missing))
+            await until(lambda: "no other node" not in lonely.queries.explain_missing(missing))
 
     async def test_only_services_of_other_nodes_count(self, lonely: Opened) -> None:
         """Those of a node of the same name too: the graph shows the two as one."""
@@ -176,9 +176,9 @@ class TestMissing:
             twin.create_service(Trigger, "/far", nothing)
             own = len(list(twin.services))
             await until(
-                lambda: f"among {own} services of other" in lonely.ros.explain_missing(missing)
+                lambda: f"among {own} services of other" in lonely.queries.explain_missing(missing)
             )
-            assert "there are /far" in lonely.ros.explain_missing(lonely.service("/z", Trigger))
+            assert "there are /far" in lonely.queries.explain_missing(lonely.service("/z", Trigger))
 
     @pytest.mark.parametrize(
         ("setting", "expected"),
@@ -199,17 +199,17 @@ class TestMissing:
             monkeypatch.delenv(name, raising=False)
         for name, value in setting.items():
             monkeypatch.setenv(name, value)
-        assert expected in lonely.ros.explain_missing(lonely.service("/ecco"))
+        assert expected in lonely.queries.explain_missing(lonely.service("/ecco"))
 
     async def test_another_type(self, opened: Opened) -> None:
         service = opened.service()
-        assert opened.ros.explain_mismatch(service) is None
+        assert opened.queries.explain_mismatch(service) is None
         with borrowed_node() as lender:
             lender.create_service(Trigger, "/echo", nothing)
             expected = "this name is served as std_srvs/srv/Trigger by node /lender"
-            await until(lambda: opened.ros.explain_mismatch(service) == expected)
-            assert opened.ros.explain_missing(service) == expected
-            assert opened.ros.explain_mismatch(opened.service(srv_type=Trigger)) is None
+            await until(lambda: opened.queries.explain_mismatch(service) == expected)
+            assert opened.queries.explain_missing(service) == expected
+            assert opened.queries.explain_mismatch(opened.service(srv_type=Trigger)) is None
 
     async def test_other_types_of_two_nodes_of_the_same_name(self, opened: Opened) -> None:
         """In a query by node, the one hides the other's services."""
@@ -221,10 +221,10 @@ class TestMissing:
                 "this name is served as std_srvs/srv/SetBool by node /twin "
                 "and as std_srvs/srv/Trigger by node /twin"
             )
-            await until(lambda: opened.ros.explain_mismatch(service) == expected)
+            await until(lambda: opened.queries.explain_mismatch(service) == expected)
             similar = opened.service("/ecoo")
             assert "/echo (std_srvs/srv/SetBool, std_srvs/srv/Trigger)" in (
-                opened.ros.explain_missing(similar)
+                opened.queries.explain_missing(similar)
             )
 
     async def test_another_type_if_the_topics_have_other_names(
@@ -234,7 +234,7 @@ class TestMissing:
         with borrowed_node() as lender:
             lender.create_service(Trigger, "/echo", nothing)
             expected = "this name is served as std_srvs/srv/Trigger by node /lender"
-            await until(lambda: opened.ros.explain_missing(opened.service()) == expected)
+            await until(lambda: opened.queries.explain_missing(opened.service()) == expected)
 
     async def test_a_node_that_is_not_known_yet(
         self, opened: Opened, monkeypatch: pytest.MonkeyPatch
@@ -245,7 +245,7 @@ class TestMissing:
         with borrowed_node() as lender:
             lender.create_service(Trigger, "/echo", nothing)
             expected = "this name is served as std_srvs/srv/Trigger"
-            await until(lambda: opened.ros.explain_missing(opened.service()) == expected)
+            await until(lambda: opened.queries.explain_missing(opened.service()) == expected)
 
     async def test_the_right_type_among_others_is_no_mismatch(self, opened: Opened) -> None:
         with borrowed_node() as lender, borrowed_node("other") as other:
@@ -253,10 +253,11 @@ class TestMissing:
             other.create_service(SetBool, "/echo", nothing)
             service = opened.service(srv_type=SetBool)
             await until(lambda: opened.ros.node.count_services("/echo") == 2)
-            assert opened.ros.explain_mismatch(service) is None
+            assert opened.queries.explain_mismatch(service) is None
             await until(
                 lambda: (
-                    "served by node /other, but not matched" in opened.ros.explain_missing(service)
+                    "served by node /other, but not matched"
+                    in opened.queries.explain_missing(service)
                 )
             )
 
@@ -269,7 +270,7 @@ class TestMissing:
                 "the client's (Best effort publisher and reliable subscription): call with qos= "
                 "and the server's QoS"
             )
-            await until(lambda: opened.ros.explain_missing(service) == expected)
+            await until(lambda: opened.queries.explain_missing(service) == expected)
 
 
 class TestEvents:
@@ -348,8 +349,8 @@ class TestExecutors:
 
         kinds: list[Any] = [events_executor, type("Derived", (events_executor,), {})]
         for kind in kinds:
-            assert node._takes_callbacks(kind.__new__(kind))
-        assert not node._takes_callbacks(None)
+            assert bridges.takes_callbacks(kind.__new__(kind))
+        assert not bridges.takes_callbacks(None)
 
     async def test_its_nodes_are_not_taken_from_directly(self) -> None:
         from rclpy.experimental.events_executor import EventsExecutor

@@ -51,7 +51,7 @@ class World:
         """Whether both sides have found each other's topics."""
         pool = self.client.pool.service(ECHO, "/told", None)
         pool.match()
-        servers = self.client.core.node.find_servers(pool.service)
+        servers = self.client.core.node.queries.find_servers(pool.service)
         return self.client.core.pool.listener.hears(servers)
 
     def call(self, text: str = "x", **options: Any) -> asyncio.Task[Any]:
@@ -300,7 +300,7 @@ async def test_a_forged_report_of_another_server_ends_nothing(world: World) -> N
     task = world.call("real")
     pool = world.client.pool.service(ECHO, "/told", None)
     await until(lambda: pool.statistics().in_flight == 1)
-    (server,) = world.client.core.node.find_servers(pool.service)
+    (server,) = world.client.core.node.queries.find_servers(pool.service)
     assert isinstance(server, bytes)
     forger = world.server.core.node.open_publisher(
         DiagnosticStatus, report_topic(str(process_of(server))), TopicQos(latched=True)
@@ -324,13 +324,13 @@ async def test_a_server_does_not_take_part_because_another_process_says_so(world
     world.server.serve(ECHO, "/told", echo_call)
     await world.client.wait_for_service(ECHO, "/told", timeout=LIMIT)
     pool = world.client.pool.service(ECHO, "/told", None)
-    (server,) = world.client.core.node.find_servers(pool.service)
+    (server,) = world.client.core.node.queries.find_servers(pool.service)
     # The client's own process is another than the server's.
     forger = world.client.core.node.open_publisher(
         DiagnosticStatus, report_topic(str(process_of(server))), TopicQos(latched=True)
     )
     topic = report_topic(str(process_of(server)))
-    await until(lambda: world.client.core.node.find_publishers(topic))
+    await until(lambda: world.client.core.node.queries.find_publishers(topic))
     world.client.core.pool.listener.on_servers(frozenset({server}))
     assert not world.client.core.pool.listener.hears(frozenset({server}))
     assert answer_to(await world.call("answered")) == "answered"

@@ -60,7 +60,7 @@ async def _play(steps: list[Step]) -> list[Any]:
         ]
         calls = await holder.held(CALLS)
         pool = client.pool.service(ECHO, "/told", None)
-        (right,) = client.core.node.find_servers(pool.service)
+        (right,) = client.core.node.queries.find_servers(pool.service)
         assert isinstance(right, bytes)
         publisher = server.core.node.open_publisher(
             DiagnosticStatus, report_topic(str(process_of(right))), TopicQos()

@@ -665,7 +665,7 @@ class ActionClient:
 
     def _find_servers(self) -> Servers:
         if self._servers is None:
-            self._servers = self._node.find_servers(self.action.get_result)
+            self._servers = self._node.queries.find_servers(self.action.get_result)
         return self._servers
 
     def _has_one_server(self) -> bool:

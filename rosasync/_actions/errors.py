@@ -37,7 +37,7 @@ class GoalErrors:
 
     def unavailable(self, goal: ActiveGoal) -> CallError:
         """Return the error for a goal that found no server."""
-        seen = self._node.explain_missing(self._action.send_goal)
+        seen = self._node.queries.explain_missing(self._action.send_goal)
         # The graph shows the services of actions.
         seen = seen.replace("/_action/send_goal", "").replace("_SendGoal", "")
         elapsed = self._elapsed(goal)

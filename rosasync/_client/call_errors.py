@@ -23,7 +23,7 @@ from rosasync.errors import (
 
 if TYPE_CHECKING:
     from rosasync._client.retry import Plan
-    from rosasync._core.ports import NodePort, Service
+    from rosasync._core.ports import GraphPort, Service
     from rosasync._status.wire import Report
 
 __all__ = ["AllServersGone", "CallErrors", "NoServer", "Refused"]
@@ -55,9 +55,9 @@ class Refused(Exception):
 class CallErrors:
     """Makes the errors of one service's calls. ``elapsed`` is in seconds."""
 
-    def __init__(self, service: Service, node: NodePort, clock: Callable[[], float]) -> None:
+    def __init__(self, service: Service, queries: GraphPort, clock: Callable[[], float]) -> None:
         self._service = service
-        self._node = node
+        self._queries = queries
         self._clock = clock
         # The last explanation of what the graph shows, and until when it may be used again.
         self._seen = ""
@@ -98,7 +98,7 @@ class CallErrors:
         if plan is not None:
             message += plan.explain_timeout()
         with contextlib.suppress(ContextShutdown):
-            if elapsed >= SETTLED and (silence := self._node.explain_silence(self._service)):
+            if elapsed >= SETTLED and (silence := self._queries.explain_silence(self._service)):
                 message += f"; {silence}"
         return self._make(ResponseTimeout, message, elapsed)
 
@@ -145,7 +145,7 @@ class CallErrors:
         """
         now = self._clock()
         if now >= self._seen_until:
-            self._seen = self._node.explain_missing(self._service)
+            self._seen = self._queries.explain_missing(self._service)
             ended = self._clock()
             self._seen_until = ended + SHARED * (ended - now)
         return self._seen

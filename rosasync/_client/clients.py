@@ -62,7 +62,7 @@ class Clients:
         listener: Listener,
     ) -> None:
         self.share = 0
-        self.matching = Matching(service, node, watch, self)
+        self.matching = Matching(service, node.queries, watch, self)
         self._service = service
         self._node = node
         self._limits = limits
@@ -196,7 +196,7 @@ class Clients:
     def resize(self) -> None:
         """Set the window of every client to its share of the server's queue."""
         self.matching.count_servers()
-        clients = self._node.count_clients(self._service)
+        clients = self._node.queries.count_clients(self._service)
         self.share = self._limits.share(clients)
         for client in self._clients:
             client.resize(self._limits.window(clients))

@@ -10,7 +10,7 @@ from rosasync._core.text import count
 
 if TYPE_CHECKING:
     from rosasync._client.graph_watch import GraphWatch
-    from rosasync._core.ports import NodePort, Servers, Service
+    from rosasync._core.ports import GraphPort, Servers, Service
 
 __all__ = ["GONE_DELAY", "Matching", "MatchingOwner"]
 
@@ -56,12 +56,12 @@ class Matching:
     """
 
     def __init__(
-        self, service: Service, node: NodePort, watch: GraphWatch, owner: MatchingOwner
+        self, service: Service, queries: GraphPort, watch: GraphWatch, owner: MatchingOwner
     ) -> None:
         self.servers: Servers = frozenset()
         self.count = 0
         self._service = service
-        self._node = node
+        self._queries = queries
         self._watch = watch
         self._owner = owner
         self._loop = asyncio.get_running_loop()
@@ -75,7 +75,7 @@ class Matching:
 
     def count_servers(self) -> None:
         """Count the servers of the name. Call it after every change of the graph."""
-        servers = self._node.count_servers(self._service)
+        servers = self._queries.count_servers(self._service)
         if servers != self.count:
             name = self._service.key.srv_name
             logger.debug("%s: the graph shows %s", name, count(servers, "server"))
@@ -88,12 +88,12 @@ class Matching:
 
     def provided(self) -> bool:
         """Return whether the graph shows a server that fits."""
-        return bool(self._node.find_servers(self._service))
+        return bool(self._queries.find_servers(self._service))
 
     def all_gone(self) -> bool:
         """Return whether no fitting server is left; other servers of the name do not count."""
         # The two cheap queries first.
-        if not self._node.count_servers(self._service):
+        if not self._queries.count_servers(self._service):
             return True
         return not self._owner.any_ready() and not self.provided()
 
@@ -101,10 +101,10 @@ class Matching:
         """Warn if there are more servers than ever, without those that have crashed."""
         if len(self.servers) <= self._most:
             return
-        servers = len(self.servers - self._node.find_ended(self.servers))
+        servers = len(self.servers - self._queries.find_ended(self.servers))
         if servers > self._most:
             self._most = servers
-            names = self._node.name_servers(self._service)
+            names = self._queries.name_servers(self._service)
             logger.warning(
                 "%s: %d servers answer this name%s. Each runs every request, and all responses "
                 "but the first are dropped: stop all but one. After a crash, the dead one is shown "
@@ -128,7 +128,7 @@ class Matching:
 
     def _learn(self) -> None:
         self._generation = self._watch.generation
-        self.servers = self._node.find_servers(self._service)
+        self.servers = self._queries.find_servers(self._service)
         self._owner.on_servers(self.servers)
 
     def _end_later(self) -> None:

@@ -6,7 +6,7 @@ import logging
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from rosasync._core.ports import NodePort, Service
+    from rosasync._core.ports import GraphPort, Service
 
 __all__ = ["MISMATCH_DELAY", "MISMATCH_LOGGER", "MismatchReporter"]
 
@@ -19,9 +19,9 @@ MISMATCH_DELAY = 1.0
 class MismatchReporter:
     """Logs one warning for each mismatch that keeps callers of a service waiting."""
 
-    def __init__(self, service: Service, node: NodePort) -> None:
+    def __init__(self, service: Service, queries: GraphPort) -> None:
         self._service = service
-        self._node = node
+        self._queries = queries
         # When callers began to wait for a match; None while none does.
         self._since: float | None = None
         # What the last warning said, so that it is not repeated.
@@ -43,7 +43,7 @@ class MismatchReporter:
 
     def warn(self) -> None:
         """Warn if every server has another type and no warning has said so."""
-        mismatch = self._node.explain_mismatch(self._service)
+        mismatch = self._queries.explain_mismatch(self._service)
         if mismatch is not None and mismatch != self._said:
             logging.getLogger(MISMATCH_LOGGER).warning(
                 "%s: callers wait for a server of type %s, but %s: call it with the server's type, "

@@ -67,7 +67,7 @@ class ServicePool:
         self._tracing = tracing
         self._traces = ClientTracing(tracing, service.key)
         self._loop = asyncio.get_running_loop()
-        self._errors = CallErrors(service, node, monotonic)
+        self._errors = CallErrors(service, node.queries, monotonic)
         self._counts = Counts()
         self._budget = RetryBudget(self._counts, self._loop.time)
         self._dispatch = Dispatch(
@@ -82,7 +82,7 @@ class ServicePool:
             listener,
         )
         self._clients = self._dispatch.clients
-        self._mismatch = MismatchReporter(service, node)
+        self._mismatch = MismatchReporter(service, node.queries)
         self._ending: Callable[[], Exception] | None = None
 
     def __repr__(self) -> str:

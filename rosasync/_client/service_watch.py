@@ -38,21 +38,21 @@ async def watch_servers(
 
     Args:
         service: the service.
-        node: the node that shows the graph.
+        node: the node whose graph is watched.
         changed: set when the graph has changed, and when the session ends.
         check_open: raises once the session has ended.
     """
-    before = None
+    before, queries = None, node.queries
     while True:
         check_open()
         changed.clear()
-        servers = node.find_servers(service)
+        servers = queries.find_servers(service)
         if servers != before:
             if not servers:
                 yield ServiceState("gone", ())
             else:
                 replaced = bool(before) and not servers & (before or servers)
-                yield ServiceState("replaced" if replaced else "up", node.name_servers(service))
+                yield ServiceState("replaced" if replaced else "up", queries.name_servers(service))
             before = servers
             # The graph may have changed while the caller had the state.
             continue

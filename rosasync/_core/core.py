@@ -228,7 +228,7 @@ class Core:
         stuck = False
         try:
             with anyio.move_on_after(END_TIMEOUT, shield=True) as scope:
-                await self.node.stopped()
+                await self.node.wait_stopped()
             stuck = scope.cancelled_caught
         finally:
             if not stuck and self.node.join():

@@ -14,6 +14,7 @@ __all__ = [
     "Deliver",
     "DeliverMessage",
     "DeliverRequest",
+    "GraphPort",
     "NodePort",
     "PortDestroyed",
     "PublisherPort",
@@ -162,7 +163,7 @@ class ServicePort(Protocol):
 
     @property
     def identity(self) -> Hashable:
-        """What `NodePort.find_servers` shows for this service; None if it is unknown."""
+        """What `GraphPort.find_servers` shows for this service; None if it is unknown."""
 
     def client_of(self, header: RequestHeader) -> Hashable:
         """Return the identity of the client that sent a request; None if it is unknown."""
@@ -272,6 +273,77 @@ class SubscriptionPort(Protocol):
         """Stop delivering, and destroy the subscription; idempotent."""
 
 
+class GraphPort(Protocol):
+    """What a node's graph shows. Call the methods on the loop's thread; every one returns at once.
+
+    What another process has just changed may be missing.
+    """
+
+    def count_servers(self, service: Service) -> int:
+        """Return how many servers have the service's name, whatever their type and QoS. Cheap.
+
+        Raises:
+            ContextShutdown: the node is down.
+        """
+
+    def count_clients(self, service: Service) -> int:
+        """Return how many clients have the service's name, in all processes. Cheap.
+
+        Raises:
+            ContextShutdown: the node is down.
+        """
+
+    def find_servers(self, service: Service) -> Servers:
+        """Identify the servers that fit: by name, type and QoS.
+
+        If the middleware does not identify servers, the set has a placeholder for each server of
+        the name.
+
+        Raises:
+            ContextShutdown: the node is down.
+        """
+
+    def find_ended(self, servers: Servers) -> Servers:
+        """Return those of these servers whose process has certainly ended without its clean-up.
+
+        The graph still shows them until their lease runs out.
+
+        Raises:
+            ContextShutdown: the node is down.
+        """
+
+    def name_servers(self, service: Service) -> tuple[str, ...]:
+        """Return the full names of the nodes that serve this name and type, as far as known.
+
+        Raises:
+            ContextShutdown: the node is down.
+        """
+
+    def find_publishers(self, topic_name: str) -> frozenset[Hashable]:
+        """Identify the publishers of a topic, in all processes. Cheap if there are none.
+
+        Raises:
+            ContextShutdown: the node is down.
+        """
+
+    def explain_missing(self, service: Service) -> str:
+        """Describe what the graph shows instead of this service, as a clause."""
+
+    def explain_mismatch(self, service: Service) -> str | None:
+        """Describe the servers of the name as a clause, if all of them have another type.
+
+        Raises:
+            ContextShutdown: the node is down.
+        """
+
+    def explain_silence(self, service: Service) -> str | None:
+        """Describe why no data arrives from a visible server, as a clause, if that is known.
+
+        Raises:
+            ContextShutdown: the node is down.
+        """
+
+
 class NodePort(Protocol):
     """One node, with its executor thread and its bridge.
 
@@ -293,6 +365,10 @@ class NodePort(Protocol):
     @property
     def executor_thread(self) -> int | None:
         """The identifier of the executor thread, if the session started it."""
+
+    @property
+    def queries(self) -> GraphPort:
+        """What the node's graph shows."""
 
     @property
     def graph_events(self) -> bool:
@@ -372,77 +448,13 @@ class NodePort(Protocol):
             Exception: as `open_client`.
         """
 
-    def count_servers(self, service: Service) -> int:
-        """Return how many servers have the service's name, whatever their type and QoS. Cheap.
-
-        Raises:
-            ContextShutdown: the node is down.
-        """
-
-    def count_clients(self, service: Service) -> int:
-        """Return how many clients have the service's name, in all processes. Cheap.
-
-        Raises:
-            ContextShutdown: the node is down.
-        """
-
-    def find_servers(self, service: Service) -> Servers:
-        """Identify the servers that fit: by name, type and QoS.
-
-        If the middleware does not identify servers, the set has a placeholder for each server of
-        the name.
-
-        Raises:
-            ContextShutdown: the node is down.
-        """
-
-    def find_ended(self, servers: Servers) -> Servers:
-        """Return those of these servers whose process has certainly ended without its clean-up.
-
-        The graph still shows them until their lease runs out.
-
-        Raises:
-            ContextShutdown: the node is down.
-        """
-
-    def name_servers(self, service: Service) -> tuple[str, ...]:
-        """Return the full names of the nodes that serve this name and type, as far as known.
-
-        Raises:
-            ContextShutdown: the node is down.
-        """
-
-    def find_publishers(self, topic_name: str) -> frozenset[Hashable]:
-        """Identify the publishers of a topic, in all processes. Cheap if there are none.
-
-        Raises:
-            ContextShutdown: the node is down.
-        """
-
-    def explain_missing(self, service: Service) -> str:
-        """Describe what the graph shows instead of this service, as a clause."""
-
-    def explain_mismatch(self, service: Service) -> str | None:
-        """Describe the servers of the name as a clause, if all of them have another type.
-
-        Raises:
-            ContextShutdown: the node is down.
-        """
-
-    def explain_silence(self, service: Service) -> str | None:
-        """Describe why no data arrives from a visible server, as a clause, if that is known.
-
-        Raises:
-            ContextShutdown: the node is down.
-        """
-
     def stop(self) -> None:
         """Ask the executor thread to end. From any thread; idempotent; takes no lock."""
 
     def join(self) -> bool:
         """Wait for the executor thread to end and return whether it did; blocks."""
 
-    async def stopped(self) -> None:
+    async def wait_stopped(self) -> None:
         """Wait, after `stop`, until `join` returns at once and `close` is safe."""
 
     def close(self) -> None:

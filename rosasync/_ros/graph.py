@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from time import monotonic
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from weakref import WeakValueDictionary
 
 import rclpy
@@ -19,10 +19,11 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.waitable import NumberOfEntities, Waitable
 
-from rosasync._core.ports import Service
+from rosasync._core.ports import Servers, Service
 from rosasync._core.text import count
 from rosasync._ros.endpoints import (
     Endpoint,
+    gid_of,
     identified_servers,
     incompatibility,
     response_writers,
@@ -30,9 +31,13 @@ from rosasync._ros.endpoints import (
     serves,
 )
 from rosasync._ros.failures import uses_node
+from rosasync._ros.host import ended
 from rosasync._ros.names import SEND_GOAL, default_qos
 from rosasync._ros.rcl import Rcl
 from rosasync._ros.silence import explain_silence
+
+if TYPE_CHECKING:
+    from rosasync._core.ports import GraphPort
 
 __all__ = ["GraphQueries", "GraphWaitable", "describe_similar"]
 
@@ -109,7 +114,9 @@ class GraphWaitable(Waitable):  # type: ignore[misc]
 
 
 class GraphQueries:
-    """Queries a node's graph for services. Used on the loop's thread, except `changed`.
+    """Queries a node's graph: a `rosasync._core.ports.GraphPort`.
+
+    Used on the loop's thread, except `changed`.
 
     Args:
         node: the node to query.
@@ -132,17 +139,17 @@ class GraphQueries:
         self._generation += 1
 
     def count_servers(self, service: Service) -> int:
-        """Count the servers of the name; see `rosasync._core.ports.NodePort.count_servers`."""
+        """Count the servers of the name; see `rosasync._core.ports.GraphPort.count_servers`."""
         with uses_node(self._node):
             return self._count_servers(service.key.srv_name)
 
     def count_clients(self, service: Service) -> int:
-        """Count the clients of the name; see `rosasync._core.ports.NodePort.count_clients`."""
+        """Count the clients of the name; see `rosasync._core.ports.GraphPort.count_clients`."""
         with uses_node(self._node), self._node.handle:
             return int(self._node.handle.get_count_clients(service.key.srv_name))
 
     def find_servers(self, service: Service) -> frozenset[Hashable]:
-        """Identify the servers that fit; see `rosasync._core.ports.NodePort.find_servers`."""
+        """Identify the servers that fit; see `rosasync._core.ports.GraphPort.find_servers`."""
         name, srv_type, _ = service.key
         with uses_node(self._node):
             if found := identified_servers(self._node, name):
@@ -154,11 +161,24 @@ class GraphQueries:
         return frozenset()
 
     def name_servers(self, service: Service) -> tuple[str, ...]:
-        """Name the nodes of the servers; see `rosasync._core.ports.NodePort.name_servers`."""
+        """Name the nodes of the servers; see `rosasync._core.ports.GraphPort.name_servers`."""
         srv_name, srv_type, _ = service.key
         with uses_node(self._node):
             servers = self._servers_of(srv_name)
         return tuple(sorted({s.node for s in servers if s.node and s.srv_type == srv_type}))
+
+    def find_ended(self, servers: Servers) -> Servers:
+        """Return those of these servers whose process has certainly ended."""
+        with uses_node(self._node):
+            return ended(self._node, (gid for gid in servers if isinstance(gid, bytes)))
+
+    def find_publishers(self, topic_name: str) -> frozenset[Hashable]:
+        """Identify the publishers of a topic, in all processes."""
+        with uses_node(self._node):
+            # The count takes a microsecond, and the list some hundred.
+            if not self._node.count_publishers(topic_name):
+                return frozenset()
+            return frozenset(map(gid_of, self._node.get_publishers_info_by_topic(topic_name)))
 
     def explain_missing(self, service: Service) -> str:
         """Describe what the graph shows instead of this service, as a clause."""
@@ -322,3 +342,9 @@ def _discovery_range() -> str:
     if os.environ.get("ROS_LOCALHOST_ONLY") == "1":
         return "LOCALHOST (ROS_LOCALHOST_ONLY=1)"
     return (os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE") or "SUBNET").upper()
+
+
+if TYPE_CHECKING:
+
+    def _fits(queries: GraphQueries) -> GraphPort:
+        return queries

@@ -97,7 +97,7 @@ class Listener:
 
     def _takes_part(self, process: str) -> bool:
         """Return whether a process publishes reports itself, and not only another in its name."""
-        publishers = self._node.find_publishers(report_topic(process))
+        publishers = self._node.queries.find_publishers(report_topic(process))
         return process in map(process_of, publishers)
 
     def _take(self, process: str, message: Any) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from rosasync._core.opening import RosOpener
 from rosasync.session import Session
-from rosasync.testing._memory.graph import MemoryNode
+from rosasync.testing._memory.graph import MemoryNode, MemoryQueries
 
 if TYPE_CHECKING:
     from rosasync._core.gateway import LoopGateway
@@ -121,6 +121,7 @@ class HookedMemoryNode(MemoryNode):
         on_shutdown: Callable[[], None],
     ) -> None:
         super().__init__(graph, on_graph, on_shutdown, name)
+        self.queries = _HookedQueries(graph, hooks)
         self._hooks = hooks
 
     def open_client(self, service: Service, deliver: Deliver) -> Any:
@@ -130,6 +131,14 @@ class HookedMemoryNode(MemoryNode):
     def open_service(self, service: Service, deliver: DeliverRequest) -> Any:
         """Create a service that passes its requests to ``deliver``."""
         return self._hooks.open_service(super().open_service, service, deliver)
+
+
+class _HookedQueries(MemoryQueries):
+    """Queries that report a service which was called and has no server."""
+
+    def __init__(self, graph: MemoryGraph, hooks: Hooks) -> None:
+        super().__init__(graph)
+        self._hooks = hooks
 
     def explain_missing(self, service: Service) -> str:
         """List the services in the graph, and report that this one is missing."""

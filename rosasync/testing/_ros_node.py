@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from rosasync._ros.graph import GraphQueries
 from rosasync._ros.node import RosNode
 
 if TYPE_CHECKING:
@@ -27,8 +28,9 @@ class HookedRosNode(RosNode):
         on_shutdown: Callable[[], None],
         hooks: Hooks,
     ) -> None:
-        super().__init__(options, gateway, on_graph, on_shutdown)
+        # First, because the opening makes the queries.
         self._hooks = hooks
+        super().__init__(options, gateway, on_graph, on_shutdown)
 
     def open_client(self, service: Service, deliver: Deliver) -> ClientPort:
         """Create a client that passes its responses to ``deliver``."""
@@ -37,6 +39,17 @@ class HookedRosNode(RosNode):
     def open_service(self, service: Service, deliver: DeliverRequest) -> ServicePort:
         """Create a service that passes its requests to ``deliver``."""
         return self._hooks.open_service(super().open_service, service, deliver)
+
+    def _make_queries(self, events: bool) -> GraphQueries:
+        return _HookedQueries(self.node, events, self._hooks)
+
+
+class _HookedQueries(GraphQueries):
+    """Queries that report a service which was called and has no server."""
+
+    def __init__(self, node: Any, events: bool, hooks: Hooks) -> None:
+        super().__init__(node, events)
+        self._hooks = hooks
 
     def explain_missing(self, service: Service) -> str:
         """Describe what the graph shows instead, and report that the service is missing."""

@@ -27,7 +27,7 @@ from rosasync import (
     SessionClosed,
     UsageError,
 )
-from rosasync.testing._memory.graph import MemoryNode
+from rosasync.testing._memory.graph import MemoryNode, MemoryQueries
 from rosasync.testing._memory.services import MemoryClient
 from tests.support.fake_graph import FakeGraph
 from tests.support.plain import Echo, echo
@@ -561,7 +561,7 @@ async def test_servers_that_have_crashed_do_not_count_as_several(
     """The graph shows one for some time after its end, when its successor is there already."""
     first, _ = (fake_graph.serve(Echo, "/echo", echo) for _ in range(2))
     crashed = frozenset({first.identity})
-    monkeypatch.setattr(MemoryNode, "find_ended", lambda node, servers: crashed & servers)
+    monkeypatch.setattr(MemoryQueries, "find_ended", lambda graph, servers: crashed & servers)
     async with opened(fake_graph) as session:
         with caplog.at_level(logging.WARNING, "rosasync"):
             assert await ask(session, 1) == 1

@@ -430,7 +430,7 @@ async def test_a_call_whose_error_cannot_be_explained_is_counted(fake_graph: Fak
         def explain_missing(_: object) -> str:
             raise ContextShutdown
 
-        node.explain_missing = explain_missing
+        node.queries.explain_missing = explain_missing
         with pytest.raises(ContextShutdown):
             await ask(session, 1, timeout=TICK / 10)
         assert session.pool.statistics().failed == 1

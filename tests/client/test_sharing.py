@@ -212,7 +212,7 @@ async def test_a_call_ends_when_its_stock_server_is_replaced(
             await server.received("/replaced", 1)
             await successor.serve("/replaced")
             service = session.core.arguments.service(ECHO, "/replaced", None)
-            await until(lambda: len(session.core.node.find_servers(service)) == 2)
+            await until(lambda: len(session.core.node.queries.find_servers(service)) == 2)
             await server.stop("/replaced")
             with pytest.raises(ServerGone):
                 await asyncio.wait_for(call, LIMIT)

@@ -11,7 +11,15 @@ import rclpy
 from rclpy.signals import SignalHandlerOptions
 
 from rosasync._core.gateway import LoopGateway
-from rosasync._core.ports import ClientPort, Deliver, DeliverRequest, NodePort, Service, ServicePort
+from rosasync._core.ports import (
+    ClientPort,
+    Deliver,
+    DeliverRequest,
+    GraphPort,
+    NodePort,
+    Service,
+    ServicePort,
+)
 from rosasync._ros.node import RosNode
 from rosasync.options import Limits, SessionOptions
 from tests.support.echo import ECHO, answer_to
@@ -43,6 +51,11 @@ class Opened:
     def port(self) -> NodePort:
         """The node, typed as the port that the core uses."""
         return self.ros
+
+    @property
+    def queries(self) -> GraphPort:
+        """What the node's graph shows."""
+        return self.ros.queries
 
     def service(self, name: str = "/echo", srv_type: Any = ECHO, qos: Any = None) -> Service:
         return self.ros.describe(srv_type, name, qos)
@@ -104,7 +117,7 @@ async def open_node(bridge: str, node: Any = "test_node", **options: Any) -> Asy
         yield opened
     finally:
         opened.ros.stop()
-        await opened.ros.stopped()
+        await opened.ros.wait_stopped()
         assert opened.ros.join()
         gateway.close()
         opened.ros.close()

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from rosasync._core.ports import Deliver, DeliverMessage, DeliverRequest, TopicQos
     from rosasync.testing._memory.services import ServiceGraph
 
-__all__ = ["MemoryGraph", "MemoryNode", "new_identity", "new_process"]
+__all__ = ["MemoryGraph", "MemoryNode", "MemoryQueries", "new_identity", "new_process"]
 
 NAME = re.compile(r"/?[a-z_]\w*(/[a-z_]\w*)*", re.ASCII | re.IGNORECASE)
 """A name that ROS allows."""
@@ -90,6 +90,64 @@ class MemoryGraph:
         asyncio.get_running_loop().call_soon(client.deliver, number, response)
 
 
+class MemoryQueries:
+    """What a `MemoryGraph` shows: a `rosasync._core.ports.GraphPort`."""
+
+    def __init__(self, graph: MemoryGraph) -> None:
+        self._graph = graph
+
+    def count_servers(self, service: Service) -> int:
+        """Return how many servers have this name."""
+        return sum(server.srv_name == service.key.srv_name for server in self._graph.servers)
+
+    def count_clients(self, service: Service) -> int:
+        """Return how many clients have this name, of all nodes."""
+        return sum(client.srv_name == service.key.srv_name for client in self._graph.clients)
+
+    def find_servers(self, service: Service) -> frozenset[Hashable]:
+        """Identify the servers of this name and type."""
+        return frozenset(
+            server.identity
+            for server in self._graph.find(service.key.srv_type, service.key.srv_name)
+        )
+
+    def find_ended(self, servers: frozenset[Hashable]) -> frozenset[Hashable]:
+        """Return none of these servers: in memory, one that ends leaves the graph."""
+        return frozenset()
+
+    def name_servers(self, service: Service) -> tuple[str, ...]:
+        """Return a name for each server: in memory, servers need no node."""
+        servers = self._graph.find(service.key.srv_type, service.key.srv_name)
+        return tuple(f"/server_{number}" for number, _ in enumerate(servers, start=1))
+
+    def find_publishers(self, topic_name: str) -> frozenset[Hashable]:
+        """Identify the publishers of a topic."""
+        return frozenset(
+            publisher.identity
+            for publisher in self._graph.topics.publishers
+            if publisher.topic_name == topic_name
+        )
+
+    def explain_missing(self, service: Service) -> str:
+        """List the services in the graph, with their types."""
+        if mismatch := self.explain_mismatch(service):
+            return mismatch
+        services = {f"{each.srv_name} ({type_name(each.srv_type)})" for each in self._graph.servers}
+        return f"the graph has {', '.join(sorted(services)) or 'no service'}"
+
+    def explain_mismatch(self, service: Service) -> str | None:
+        """Describe the servers of the name as a clause, if all of them have another type."""
+        name, wanted, _ = service.key
+        types = {type_name(s.srv_type) for s in self._graph.servers if s.srv_name == name}
+        if not types or wanted in types:
+            return None
+        return f"this name is served as {' and as '.join(sorted(types))}"
+
+    def explain_silence(self, service: Service) -> str | None:
+        """Return None: nothing gets lost in memory."""
+        return None
+
+
 class MemoryNode:
     """A node of a `MemoryGraph`: a `rosasync._core.ports.NodePort`."""
 
@@ -104,6 +162,7 @@ class MemoryNode:
         name: str = "memory",
     ) -> None:
         self.graph = graph
+        self.queries = MemoryQueries(graph)
         self.name = name
         self.node = self
         self.process = new_process()
@@ -210,57 +269,6 @@ class MemoryNode:
         name = self._resolve(topic_name, "topic")
         return MemorySubscription(self.graph.topics, msg_type, name, qos, deliver, raw)
 
-    def count_servers(self, service: Service) -> int:
-        """Return how many servers have this name."""
-        return sum(server.srv_name == service.key.srv_name for server in self.graph.servers)
-
-    def count_clients(self, service: Service) -> int:
-        """Return how many clients have this name, of all nodes."""
-        return sum(client.srv_name == service.key.srv_name for client in self.graph.clients)
-
-    def find_servers(self, service: Service) -> frozenset[Hashable]:
-        """Identify the servers of this name and type."""
-        return frozenset(
-            server.identity
-            for server in self.graph.find(service.key.srv_type, service.key.srv_name)
-        )
-
-    def find_ended(self, servers: frozenset[Hashable]) -> frozenset[Hashable]:
-        """Return none of these servers: in memory, one that ends leaves the graph."""
-        return frozenset()
-
-    def name_servers(self, service: Service) -> tuple[str, ...]:
-        """Return a name for each server: in memory, servers need no node."""
-        servers = self.graph.find(service.key.srv_type, service.key.srv_name)
-        return tuple(f"/server_{number}" for number, _ in enumerate(servers, start=1))
-
-    def find_publishers(self, topic_name: str) -> frozenset[Hashable]:
-        """Identify the publishers of a topic."""
-        return frozenset(
-            publisher.identity
-            for publisher in self.graph.topics.publishers
-            if publisher.topic_name == topic_name
-        )
-
-    def explain_missing(self, service: Service) -> str:
-        """List the services in the graph, with their types."""
-        if mismatch := self.explain_mismatch(service):
-            return mismatch
-        services = {f"{each.srv_name} ({type_name(each.srv_type)})" for each in self.graph.servers}
-        return f"the graph has {', '.join(sorted(services)) or 'no service'}"
-
-    def explain_mismatch(self, service: Service) -> str | None:
-        """Describe the servers of the name as a clause, if all of them have another type."""
-        name, wanted, _ = service.key
-        types = {type_name(s.srv_type) for s in self.graph.servers if s.srv_name == name}
-        if not types or wanted in types:
-            return None
-        return f"this name is served as {' and as '.join(sorted(types))}"
-
-    def explain_silence(self, service: Service) -> str | None:
-        """Return None: nothing gets lost in memory."""
-        return None
-
     def stop(self) -> None:
         """Do nothing: there is no thread."""
 
@@ -268,7 +276,7 @@ class MemoryNode:
         """Return True: there is no thread."""
         return True
 
-    async def stopped(self) -> None:
+    async def wait_stopped(self) -> None:
         """Return at once: there is no thread."""
 
     def close(self) -> None:
