@@ -26,20 +26,27 @@ the parameter.
 
 from __future__ import annotations
 
-import enum
-import numbers
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence, Set
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias, overload
 
 import anyio
 
-from rosasync import RosasyncError, to_dict
+from rosasync import RosasyncError
 from rosasync._core.node_client import NodeClient
 from rosasync._core.parameter_files import read_file, write_file
+from rosasync._core.parameter_types import (
+    ParameterDescriptor,
+    ParameterRange,
+    ParameterType,
+    descriptor_of,
+    from_ros,
+    is_value,
+    to_ros,
+    typed_value,
+)
 from rosasync._core.safe_yaml import YamlError, read_bytes
 
 if TYPE_CHECKING:
@@ -63,78 +70,6 @@ NOT_DECLARED = "it is not declared, or has no value"
 UNKNOWN = "it may have set them, or not"
 NO_BYTES = "a parameter file has no byte arrays"
 NO_EMPTY = "a parameter file has no empty arrays"
-
-
-class ParameterType(enum.IntEnum):
-    """The type of a parameter; the values are those of ``rcl_interfaces/msg/ParameterType``."""
-
-    NOT_SET = 0
-    BOOL = 1
-    INTEGER = 2
-    DOUBLE = 3
-    STRING = 4
-    BYTE_ARRAY = 5
-    BOOL_ARRAY = 6
-    INTEGER_ARRAY = 7
-    DOUBLE_ARRAY = 8
-    STRING_ARRAY = 9
-
-    @property
-    def field(self) -> str:
-        """The field of ``rcl_interfaces/msg/ParameterValue`` that holds such a value."""
-        return f"{self.name.lower()}_value"
-
-    @property
-    def is_array(self) -> bool:
-        """Whether it is one of the arrays."""
-        return self >= ParameterType.BYTE_ARRAY
-
-
-ARRAY_OF = {
-    ParameterType.BOOL: ParameterType.BOOL_ARRAY,
-    ParameterType.INTEGER: ParameterType.INTEGER_ARRAY,
-    ParameterType.DOUBLE: ParameterType.DOUBLE_ARRAY,
-    ParameterType.STRING: ParameterType.STRING_ARRAY,
-}
-"""The type of an array, by the type of its elements."""
-
-
-@dataclass(frozen=True, slots=True)
-class ParameterRange:
-    """The values that a number may take.
-
-    Attributes:
-        minimum: the smallest value.
-        maximum: the largest value.
-        step: the distance of the values from the minimum is a multiple of this; 0 for any value.
-    """
-
-    minimum: float
-    maximum: float
-    step: float
-
-
-@dataclass(frozen=True, slots=True)
-class ParameterDescriptor:
-    """What a node says about one of its parameters.
-
-    Attributes:
-        name: the parameter's name.
-        type: its type.
-        description: what it is for.
-        constraints: constraints in plain English, besides the range.
-        read_only: whether it can be set only when the node starts.
-        dynamic_typing: whether its type may change.
-        range: the values that a number may take; None for any.
-    """
-
-    name: str
-    type: ParameterType
-    description: str = ""
-    constraints: str = ""
-    read_only: bool = False
-    dynamic_typing: bool = False
-    range: ParameterRange | None = None
 
 
 class ParameterError(RosasyncError):
@@ -252,7 +187,7 @@ class ParameterClient(NodeClient):
         found = await self._ask_all("DescribeParameters", "descriptors", names, timeout)
         return _one_or_all(
             names,
-            {name: _descriptor(one, self._kind(name, one.type)) for name, one in found.items()},
+            {name: descriptor_of(one, self._kind(name, one.type)) for name, one in found.items()},
         )
 
     @overload
@@ -379,7 +314,7 @@ class ParameterClient(NodeClient):
             await self.set(values, timeout=timeout)
         except ParameterError as error:
             current = await self._ask("GetParameters", "values", [*error.reasons], timeout)
-            same = {name for name in current if _is_value(current[name], values[name])}
+            same = {name for name in current if is_value(current[name], values[name])}
             reasons = {name: error.reasons[name] for name in error.reasons if name not in same}
             if reasons:
                 raise self._error(reasons) from None
@@ -459,14 +394,14 @@ class ParameterClient(NodeClient):
 
     async def _request(self, values: Mapping[str, object], timeout: Timeout) -> dict[str, Any]:
         """Return the request that sets these values."""
-        typed = {name: _typed(name, value) for name, value in values.items()}
+        typed = {name: typed_value(name, value) for name, value in values.items()}
         empty = [name for name, (kind, _) in typed.items() if kind is None]
         kinds = await self._types(empty, timeout)
         for name in empty:
             typed[name] = self._array_type(name, kinds.get(name)), typed[name][1]
         return {
             "parameters": [
-                {"name": name, "value": _to_ros(kind, value)}
+                {"name": name, "value": to_ros(kind, value)}
                 for name, (kind, value) in typed.items()
             ]
         }
@@ -482,7 +417,8 @@ class ParameterClient(NodeClient):
     def _values(self, found: Mapping[str, Any]) -> dict[str, Any]:
         """Return the values of ``rcl_interfaces/msg/ParameterValue`` messages."""
         return {
-            name: _value(message, self._kind(name, message.type)) for name, message in found.items()
+            name: from_ros(message, self._kind(name, message.type))
+            for name, message in found.items()
         }
 
     def _kind(self, name: str, number: int) -> ParameterType:
@@ -522,82 +458,6 @@ def _assignments(name: str | Mapping[str, object], value: object) -> Mapping[str
     if isinstance(name, Mapping) and value is ...:
         return name
     raise TypeError('give a name and a value, set("speed", 0.5), or a mapping: set({"speed": 0.5})')
-
-
-# Values
-
-
-def _typed(name: str, value: Any) -> tuple[ParameterType | None, Any]:
-    """Return the type of a value, None for an empty list; and the value without NumPy's types."""
-    if hasattr(value, "tolist"):  # NumPy's scalars and arrays, and array.array
-        value = value.tolist()
-    if isinstance(value, bytes | bytearray):
-        return ParameterType.BYTE_ARRAY, bytes(value)
-    if not isinstance(value, Sequence) or isinstance(value, str):
-        kind = _scalar_type(value)
-        if kind is not None:
-            return kind, value
-        raise TypeError(f"{name!r}: no parameter can have a {type(value).__name__}")
-    if not value:
-        return None, []
-    if all(isinstance(item, bytes) and len(item) == 1 for item in value):
-        return ParameterType.BYTE_ARRAY, b"".join(value)
-    return _array_type(name, value), value
-
-
-def _scalar_type(value: object) -> ParameterType | None:
-    if value is None:
-        return ParameterType.NOT_SET
-    if isinstance(value, bool):
-        return ParameterType.BOOL
-    if isinstance(value, numbers.Integral):
-        return ParameterType.INTEGER
-    if isinstance(value, numbers.Real):
-        return ParameterType.DOUBLE
-    return ParameterType.STRING if isinstance(value, str) else None
-
-
-def _array_type(name: str, values: Sequence[Any]) -> ParameterType:
-    kinds = {_scalar_type(value) for value in values}
-    if kinds == {ParameterType.INTEGER, ParameterType.DOUBLE}:
-        return ParameterType.DOUBLE_ARRAY
-    kind = kinds.pop()
-    if kinds or kind not in ARRAY_OF:
-        raise TypeError(
-            f"{name!r}: the elements of a list must all be bool, int, float, str or single bytes"
-        )
-    return ARRAY_OF[kind]
-
-
-def _to_ros(kind: ParameterType | None, value: Any) -> dict[str, Any]:
-    assert kind is not None
-    return {"type": kind} if kind is ParameterType.NOT_SET else {"type": kind, kind.field: value}
-
-
-def _value(message: Any, kind: ParameterType) -> Any:
-    return None if kind is ParameterType.NOT_SET else to_dict(message)[kind.field]
-
-
-def _is_value(message: Any, value: Any) -> bool:
-    """Return whether a node's value is this one; NaN is NaN, and 1 is neither 1.0 nor True."""
-    kind, value = _typed("", value)
-    return kind is not None and message.type == kind and repr(_value(message, kind)) == repr(value)
-
-
-def _descriptor(message: Any, kind: ParameterType) -> ParameterDescriptor:
-    ranges = [*message.floating_point_range, *message.integer_range]
-    return ParameterDescriptor(
-        name=message.name,
-        type=kind,
-        description=message.description,
-        constraints=message.additional_constraints,
-        read_only=message.read_only,
-        dynamic_typing=message.dynamic_typing,
-        range=next((ParameterRange(r.from_value, r.to_value, r.step) for r in ranges), None),
-    )
-
-
-# Files
 
 
 def _read(file: str, node_name: str, use_wildcard: bool) -> dict[str, Any]:
