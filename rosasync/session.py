@@ -274,7 +274,7 @@ class Session:
         core = self._opening.core or self._opening.use()
         core.check_loop()
         service = core.pool.service(srv_type, srv_name, qos)
-        message, seconds = core.arguments.call(
+        message, seconds = core.arguments.check_call(
             service.service, request, timeout, core.timeout, wait, retry
         )
         return await service.call(message, seconds, wait, retry)
@@ -326,7 +326,7 @@ class Session:
         """
         core = self._opening.use()
         service = core.pool.service(srv_type, srv_name, qos)
-        message, seconds = core.arguments.call(
+        message, seconds = core.arguments.check_call(
             service.service, request, timeout, core.timeout, wait, retry
         )
         return service.start(message, seconds, wait, retry, copy=request is not None)
@@ -388,7 +388,7 @@ class Session:
         core = self._opening.use()
         service = core.pool.service(srv_type, srv_name, qos)
         # All arguments are checked before anything is made.
-        seconds = core.arguments.defaults(timeout, core.timeout, wait, retry)
+        seconds = core.arguments.check_defaults(timeout, core.timeout, wait, retry)
         if limits is not None:
             service = core.pool.limited(service.service, limits)
         return ServiceClient(core, service, seconds, wait, retry)

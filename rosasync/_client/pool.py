@@ -320,7 +320,7 @@ class LeasedClient(Generic[RequestT, ResponseT]):
         self._busy = True
         try:
             service = self._service
-            message, seconds = self._arguments.call(
+            message, seconds = self._arguments.check_call(
                 service.service, request, timeout, self._timeout, retry=retry
             )
             response: ResponseT = await service.call(

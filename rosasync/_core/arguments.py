@@ -33,7 +33,7 @@ class ArgumentChecker:
         self._known[srv_type, srv_name] = service
         return service
 
-    def call(
+    def check_call(
         self,
         service: Service,
         request: Any,
@@ -65,7 +65,7 @@ class ArgumentChecker:
             check_wait(wait)
         return request, default
 
-    def defaults(
+    def check_defaults(
         self, timeout: Timeout, default: float | None, wait: bool | float, retry: Retry | None
     ) -> float | None:
         """Check what a client's calls use if they give nothing; return the timeout.

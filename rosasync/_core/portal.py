@@ -260,7 +260,7 @@ class Portal:
         copy: bool = False,
     ) -> _Submission:
         service = self._arguments.service(srv_type, srv_name, qos)
-        message, seconds = self._arguments.call(
+        message, seconds = self._arguments.check_call(
             service, request, timeout, self._timeout, wait, retry
         )
         if copy:

@@ -146,7 +146,7 @@ class AsyncServiceProxy(Generic[RequestT, ResponseT]):
             TypeError, ValueError: an argument does not fit; the state is unchanged.
             UsageError: the proxy was shut down.
         """
-        message, seconds = self._arguments.call(
+        message, seconds = self._arguments.check_call(
             self._service, request, timeout, self._timeout, wait
         )
         if request is not None and not self._gateway.on_loop:
@@ -159,7 +159,7 @@ class AsyncServiceProxy(Generic[RequestT, ResponseT]):
         Raises:
             TypeError, ValueError: it does not fit.
         """
-        message, _ = self._arguments.call(self._service, request, None, None)
+        message, _ = self._arguments.check_call(self._service, request, None, None)
         return cast(RequestT, message)
 
     def wait_for_service(self, timeout: Timeout = None) -> None:

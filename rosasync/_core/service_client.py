@@ -71,7 +71,7 @@ class ServiceClient(Generic[RequestT, ResponseT]):
             wait = self._wait
         if retry is None:
             retry = self._retry
-        message, seconds = core.arguments.call(
+        message, seconds = core.arguments.check_call(
             service.service, request, timeout, self._timeout, wait, retry
         )
         response: ResponseT = await service.call(message, seconds, wait, retry)
@@ -93,7 +93,7 @@ class ServiceClient(Generic[RequestT, ResponseT]):
             wait = self._wait
         if retry is None:
             retry = self._retry
-        message, seconds = core.arguments.call(
+        message, seconds = core.arguments.check_call(
             service.service, request, timeout, self._timeout, wait, retry
         )
         service.check_open()
