@@ -6,6 +6,7 @@ import asyncio
 import pickle
 import random
 from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from typing import Any
 
 import pytest
@@ -20,13 +21,14 @@ from rosasync import (
     ServerOverloaded,
     Session,
 )
+from rosasync._client.matching import GONE_DELAY
 from rosasync._core.ports import TopicQos
 from rosasync._status.wire import Outcome, Report, process_of, report_topic
 from tests.conftest import Bridge
 from tests.support.clients import ClientProcess
 from tests.support.echo import ECHO, answer_to, request_of
 from tests.support.fake_graph import FakeGraph
-from tests.support.serving import AnyCall, Gate, Holder, ask, echo_call, echo_of
+from tests.support.serving import AnyCall, Gate, Holder, ask, discard, echo_call, echo_of
 from tests.support.times import LIMIT, TICK, until
 
 MANY = Limits(in_flight=100, server_depth=None)
@@ -144,6 +146,79 @@ async def test_a_server_that_closes_says_so(world: World) -> None:
         await call
 
 
+async def test_a_server_that_closes_has_not_failed_because_it_cancels_its_handlers(
+    world: World,
+) -> None:
+    server = await world.serve(Gate())
+    call = world.call()
+    await until(lambda: server.statistics().running == 1)
+    await server.aclose(0)
+    with pytest.raises(ServerGone, match="the server"):
+        await call
+
+
+@asynccontextmanager
+async def two_servers(graph: FakeGraph) -> AsyncIterator[tuple[World, Holder]]:
+    """Two processes that serve the name, and the calls of both."""
+    async with (
+        graph.session() as first,
+        graph.session() as second,
+        graph.session(limits=MANY) as client,
+    ):
+        holder = Holder()
+        first.serve(ECHO, "/told", holder, status=True)
+        world = World(second, client)
+        await world.serve(holder)
+        yield world, holder
+
+
+async def test_a_server_reports_after_the_other_has_vanished(fake_graph: FakeGraph) -> None:
+    async with two_servers(fake_graph) as (world, holder):
+        task = world.call()
+        _, call = await holder.held(2)
+        fake_graph.servers[0].close()
+        await asyncio.sleep(2 * GONE_DELAY)
+        assert not task.done()
+        call.give_up("failed", error=LookupError("no"))
+        with pytest.raises(HandlerFailed, match="LookupError: no"):
+            await task
+
+
+async def test_a_server_vanishes_after_the_other_has_reported(fake_graph: FakeGraph) -> None:
+    async with two_servers(fake_graph) as (world, holder):
+        task = world.call()
+        _, call = await holder.held(2)
+        call.give_up("failed", error=LookupError("no"))
+        await asyncio.sleep(2 * GONE_DELAY)
+        assert not task.done()
+        fake_graph.servers[0].close()
+        with pytest.raises(HandlerFailed, match="LookupError: no"):
+            await task
+
+
+async def test_a_server_that_has_vanished_holds_no_place(fake_graph: FakeGraph) -> None:
+    async with two_servers(fake_graph) as (world, holder):
+        task = world.call()
+        await holder.held(2)
+        gone = fake_graph.servers[0]
+        for publisher in tuple(fake_graph.topics.publishers):
+            if process_of(publisher.identity) == process_of(gone.identity):
+                publisher.close()
+        gone.close()
+        await asyncio.sleep(2 * GONE_DELAY)
+        await discard(task)
+        assert world.client.pool.statistics().abandoned == 0
+
+
+async def test_a_server_reports_to_callers_that_have_waited_for_it(fake_graph: FakeGraph) -> None:
+    async with fake_graph.session() as server, fake_graph.session() as client:
+        task = client.start(ECHO, "/told", request_of("x"), timeout=LIMIT)
+        await asyncio.sleep(TICK)
+        server.serve(ECHO, "/told", fail, status=True)
+        with pytest.raises(HandlerFailed):
+            await task
+
+
 async def test_waiting_requests_of_callers_that_left_are_not_run(world: World) -> None:
     gate = Gate()
     ran: list[str] = []
@@ -193,23 +268,60 @@ async def test_a_departure_that_comes_before_its_request(
         assert (served.statistics().abandoned, served.statistics().unanswered) == (1, 0)
 
 
+async def test_an_async_handler_does_not_begin_for_a_caller_that_leaves_in_the_same_turn(
+    fake_graph: FakeGraph,
+) -> None:
+    async with fake_graph.session() as server, fake_graph.session(limits=MANY) as client:
+        world = World(server, client)
+        ran: list[str] = []
+
+        async def handler(call: AnyCall) -> Any:
+            ran.append(call.request.load_namespace)
+            return echo_of(call.request)
+
+        served = await world.serve(handler)
+        left, stays = world.call("left"), world.call("stays")
+        pool = client.pool.service(ECHO, "/told", None)
+        # It arrives in the turn in which the request does: right after it.
+        client.core.pool.listener.depart(pool.clients[0].identity, 1, pool.clients[0].servers)
+        assert answer_to(await stays) == "stays"
+        assert ran == ["stays"]
+        statistics = served.statistics()
+        assert (statistics.abandoned, statistics.running, statistics.unanswered) == (1, 0, 0)
+        await discard(left)
+
+
+async def test_what_a_handler_has_begun_before_its_first_turn_goes_on(
+    fake_graph: FakeGraph,
+) -> None:
+    async with fake_graph.session() as server, fake_graph.session(limits=MANY) as client:
+        world = World(server, client)
+
+        def handler(call: AnyCall) -> Any:
+            return asyncio.ensure_future(asyncio.sleep(0, echo_of(call.request)))
+
+        served = await world.serve(handler)
+        call = world.call()
+        pool = client.pool.service(ECHO, "/told", None)
+        client.core.pool.listener.depart(pool.clients[0].identity, 1, pool.clients[0].servers)
+        await call
+        assert served.statistics().abandoned == 0
+
+
 @pytest.mark.parametrize("count", [100, pytest.param(1000, marks=pytest.mark.slow)])
 async def test_callers_that_leave_at_random(world: World, count: int) -> None:
     choose = random.Random(1)
     ran_for_nobody: list[str] = []
     runs = 0
 
-    async def work(call: AnyCall) -> Any:
-        await asyncio.sleep(choose.random() * TICK / 10)
-        return echo_of(call.request)
-
-    def handler(call: AnyCall) -> Any:
+    async def handler(call: AnyCall) -> Any:
         nonlocal runs
         runs += 1
         # If the server knows of it: a departure is under way for a moment.
         if call.abandoned:
             ran_for_nobody.append(call.request.load_namespace)
-        return work(call)
+        await asyncio.sleep(choose.random() * TICK / 10)
+        return echo_of(call.request)
 
     server = await world.serve(handler, concurrency=10)
     calls = {str(number): world.call(str(number)) for number in range(count)}

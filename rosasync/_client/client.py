@@ -47,6 +47,9 @@ class ClientOwner(Protocol):
     def on_places(self) -> None:
         """React to places in a window that may have become free."""
 
+    def check_servers(self) -> None:
+        """Look for requests that have lost all their servers."""
+
     def callers_wait(self) -> bool:
         """Return whether callers wait for a place or a match, or calls to be sent again."""
 
@@ -174,7 +177,9 @@ class Client:
         if self.closed or self._loop.is_closed():
             return
         self.window.leave(sent, now)
-        if self._listener.depart(self._port.identity, sent.number, sent.servers):
+        # Those that have left the graph have no queue any more.
+        servers = sent.servers & self.servers
+        if self._listener.depart(self._port.identity, sent.number, servers):
             # All of its servers drop it, so it is no longer in a queue.
             self.window.forgive(sent)
             self.owner.on_places()
@@ -201,7 +206,7 @@ class Client:
         for sent in lost:
             call, sent.call = sent.call, None
             if call is not None:
-                call.lose(sent, error)
+                _lose(call, sent, error)
         self.set_timer()
         self.owner.on_places()
 
@@ -277,9 +282,11 @@ class Client:
         sent = self.window.sent.get(report.number)
         if sent is None or report.server not in sent.servers:
             return
-        sent.servers -= {report.server}
+        sent.remove_server(report)
         if sent.servers:
-            # With several servers on the name, another may still answer.
+            # With several servers on the name, another may still answer; or it has gone before.
+            if sent.servers.isdisjoint(self.servers):
+                self.owner.check_servers()
             return
         self.window.remove(sent)
         self._port.forget(sent.number)
@@ -299,3 +306,11 @@ class Client:
             self._port.forget(sent.number)
         owner.on_places()
         self.set_timer()
+
+
+def _lose(call: Caller, sent: Sent, error: Callable[[], Exception]) -> None:
+    """Tell a call that no server has its request: the last word is a report, if there was one."""
+    if sent.report is None:
+        call.lose(sent, error)
+    else:
+        call.refuse(sent, sent.report)

@@ -243,6 +243,10 @@ class Dispatch:
         if self.queue or self.passed or self.resends or self.leased:
             self.schedule()
 
+    def check_servers(self) -> None:
+        """Look for requests that have lost all their servers."""
+        self.clients.matching.check_outstanding()
+
     def on_matched(self) -> None:
         """Report to the traced calls that a client is matched: from now on they are queued."""
         self._traces.on_matched()

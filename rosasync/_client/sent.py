@@ -59,7 +59,7 @@ class Sent:
             of its call may be sent in its place.
     """
 
-    __slots__ = ("at", "call", "leased", "lost", "number", "out", "place", "servers")
+    __slots__ = ("_report", "at", "call", "leased", "lost", "number", "out", "place", "servers")
 
     def __init__(
         self, number: int, servers: Servers, at: float, call: Caller | None, leased: bool = False
@@ -72,6 +72,17 @@ class Sent:
         self.place = not leased
         self.out = 1
         self.lost = False
+
+    @property
+    def report(self) -> Report | None:
+        """What a server has last reported of it; None if none has."""
+        # Not set in the constructor, because every call comes there.
+        return getattr(self, "_report", None)
+
+    def remove_server(self, report: Report) -> None:
+        """Record that a server has reported not to answer it."""
+        self.servers -= {report.server}
+        self._report = report
 
     def __repr__(self) -> str:
         caller = "waited for" if self.call is not None else "abandoned"

@@ -30,9 +30,13 @@ class HandlerTasks:
 
     A handler that waits for the end itself, by closing its server or its session, is neither waited
     for nor cancelled: it would deadlock.
+
+    Attributes:
+        cancelled: whether the end of the server has cancelled those that were left.
     """
 
     def __init__(self) -> None:
+        self.cancelled = False
         self._loop = asyncio.get_running_loop()
         self._tasks: set[asyncio.Task[None]] = set()
         self._closers: set[asyncio.Task[Any]] = set()
@@ -88,6 +92,7 @@ class HandlerTasks:
 
     def cancel(self) -> None:
         """Cancel every task, in the next turn."""
+        self.cancelled = True
         for task in self._pending():
             # Not at once: a task that has not begun would end without running its handler's
             # `finally`, or ours.

@@ -135,7 +135,7 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
                     context,
                 )
                 if call.status is not None:
-                    call.status.task = task
+                    call.status.task, call.status.pending = task, result
         except BaseException as error:
             self._contain(call, error, self._fail)
         finally:
@@ -213,8 +213,13 @@ class HandlerRunner(Generic[RequestT, ResponseT]):
         if isinstance(pending, Coroutine):
             # Otherwise Python warns that it was never awaited.
             pending.close()
-        ended = Outcome.FAILED if self._sender.ending is None else Outcome.CLOSED
-        call.give_up("given up: its handler was cancelled", ended, error=asyncio.CancelledError())
+        # A handler that the end of the server cancels has not failed: another server may run it.
+        closed = self._tasks.cancelled
+        call.give_up(
+            "given up: its handler was cancelled",
+            Outcome.CLOSED if closed else Outcome.FAILED,
+            error=None if closed else asyncio.CancelledError(),
+        )
         if not call.responded:
             logger.log(
                 logging.DEBUG if call.abandoned else logging.WARNING,

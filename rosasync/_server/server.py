@@ -343,14 +343,19 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         call.give_up("dropped: too many requests were waiting", Outcome.DROPPED)
 
     def _on_abandoned(self, call: ServiceCall[RequestT, ResponseT]) -> None:
-        """Drop a call whose caller has left, or cancel its handler if that is wished."""
+        """Drop a call whose caller has left, or cancel its handler if that is wished.
+
+        A handler that has not begun is not run either.
+        """
         if self._intake.remove(call):
             self._drop_abandoned(call)
             return
-        task = call.status.task if call.status is not None else None
-        if self._cancel_abandoned and task is not None:
+        status = call.status
+        if status is None or status.task is None:
+            return
+        if self._cancel_abandoned or not status.has_begun:
             self._counts.abandoned += 1
-            task.cancel()
+            status.task.cancel()
 
     def _drop_abandoned(self, call: ServiceCall[RequestT, ResponseT]) -> None:
         self._counts.abandoned += 1

@@ -59,6 +59,9 @@ class ClientUnderTest:
     def make_response(self, value: object) -> Any:
         return value
 
+    def check_servers(self) -> None:
+        """Nothing: there are none."""
+
     def callers_wait(self) -> bool:
         return bool(self.queue)
 

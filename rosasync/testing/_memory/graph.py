@@ -254,6 +254,7 @@ class MemoryNode:
     def open_publisher(self, msg_type: Any, topic_name: str, qos: TopicQos) -> MemoryPublisher:
         """Create a publisher."""
         name = self._resolve(topic_name, "topic")
+        self.graph.changed_soon()
         return MemoryPublisher(self.graph.topics, msg_type, name, qos, new_identity(self.process))
 
     def open_subscription(
@@ -267,6 +268,7 @@ class MemoryNode:
     ) -> MemorySubscription:
         """Create a subscription that passes its messages to ``deliver``."""
         name = self._resolve(topic_name, "topic")
+        self.graph.changed_soon()
         return MemorySubscription(self.graph.topics, msg_type, name, qos, deliver, raw)
 
     def stop(self) -> None:
