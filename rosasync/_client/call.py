@@ -122,6 +122,11 @@ class Call:
         """Whether nothing may be sent for the caller any more."""
         return self.future.done() or (self.is_cancelled is not None and self.is_cancelled())
 
+    @property
+    def repeats(self) -> bool:
+        """Whether the next attempt goes to servers that have had one, be it dropped or not."""
+        return self.plan is not None and self.plan.sent > 0
+
     def start(self, client: Client, now: float) -> None:
         """Send the request for the first time. If that fails, set the error on the future."""
         self.client = client

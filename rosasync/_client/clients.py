@@ -118,6 +118,11 @@ class Clients:
         """Whether a server may have a request."""
         return any(client.is_outstanding for client in self._clients)
 
+    @property
+    def nothing_out(self) -> bool:
+        """Whether no request takes a place of its own."""
+        return all(client.window.idle for client in self._clients)
+
     def any_ready(self) -> bool:
         """Return whether the middleware shows a client as matched."""
         return any(_is_ready(client) for client in self._clients)

@@ -281,7 +281,7 @@ class Dispatch:
         now = self._loop.time()
         self._wake_match_waiters()
         for call in tuple(self.resends):
-            overloaded = call.newest is not None and self._is_short(call, now)
+            overloaded = call.repeats and self._is_short(call, now)
             if call.gone or overloaded or self._may_send_again(call):
                 del self.resends[call]
                 if not call.gone:
@@ -320,9 +320,10 @@ class Dispatch:
             self.overloaded_until = now + max(OVERLOAD, PERSISTENCE * needed)
             self._latest = max(self._latest, waiter.deadline) if self.passed else waiter.deadline
             self.passed[waiter] = None
-        if not self.passed or not client.window.idle:
+        if not self.passed or not self.clients.nothing_out:
             return None
         # Nothing else is out, so one that has hardly time enough finds out how quick the server is.
+        # Nothing of any client, or with many clients of one place each, all of them would find out.
         waiter = max(self.passed, key=_deadline_of)
         del self.passed[waiter]
         return None if waiter.gone else waiter

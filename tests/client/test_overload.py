@@ -9,7 +9,8 @@ from typing import Any
 
 import pytest
 
-from rosasync import Retry
+from rosasync import Limits, Retry
+from rosasync._client.dispatch import Dispatch
 from rosasync._client.retry import PER_SECOND
 from tests.support.fake_graph import FakeGraph
 from tests.support.overload import Case, Outcome, StockCaller, VirtualLoop, offer, simulate
@@ -53,6 +54,14 @@ def test_the_server_works_for_callers_that_still_wait(
     assert result.lost == 0
 
 
+def test_with_a_client_for_each_call_the_server_works_for_callers_that_still_wait() -> None:
+    """Eight requests that are out take longer than a caller has."""
+    case = Case(work=0.1, timeouts=(0.5,), load=1.5)
+    result = simulate(case, limits=Limits(clients=8, in_flight=1))
+    assert result.goodput >= 0.8
+    assert result.late <= 0.2
+
+
 @pytest.mark.parametrize("failing", ["requests", "responses"])
 def test_retries_keep_to_their_budget_whatever_fails(failing: str) -> None:
     async def scenario(graph: FakeGraph) -> None:
@@ -68,6 +77,31 @@ def test_retries_keep_to_their_budget_whatever_fails(failing: str) -> None:
             assert 0 < retried <= PER_SECOND * (1.0 + 5.5) + HASTY.budget * 500
 
     play(scenario)
+
+
+def test_what_a_server_has_dropped_is_not_sent_again_in_an_overload() -> None:
+    async def scenario(graph: FakeGraph) -> None:
+        async with graph.session() as serving, graph.session() as session:
+            server = serving.serve(Echo, "/echo", _forever, concurrency=1, backlog=0, status=True)
+            await session.wait_for_service(Echo, "/echo")
+            running = session.start(Echo, "/echo", timeout=None)
+            await asyncio.sleep(0.1)
+            calls = [session.start(Echo, "/echo", timeout=2.0, retry=HASTY) for _ in range(3)]
+            await asyncio.sleep(0.01)
+            assert server.statistics().dropped == 3
+            (client,) = session.pool.service(Echo, "/echo", None).clients
+            assert isinstance(client.owner, Dispatch)
+            client.owner.overloaded_until = 1000.0
+            errors = await asyncio.gather(*calls, return_exceptions=True)
+            assert all("the server is slower than its callers" in str(error) for error in errors)
+            assert session.pool.statistics().retried == 0
+            running.cancel()
+
+    play(scenario)
+
+
+async def _forever(request: Any, response: Any) -> Any:
+    await asyncio.Event().wait()
 
 
 @pytest.mark.parametrize("retry", [None, HASTY])
