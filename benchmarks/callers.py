@@ -249,6 +249,14 @@ class Rosasync(Asyncio):
         await self._session.aclose()
 
 
+class Leaving(Rosasync):
+    """The same, with callers that leave at their deadlines, which their session does not know."""
+
+    async def call(self, timeout: float | None) -> None:
+        async with asyncio.timeout(timeout):
+            await self._client.call(self._request, timeout=None)
+
+
 class AsyncioForRobotics(Asyncio):
     """asyncio-for-robotics, with the stock depth of ten."""
 
@@ -271,6 +279,7 @@ class AsyncioForRobotics(Asyncio):
 KINDS: dict[str, type[Caller]] = {
     "stock": Stock,
     "rosasync": Rosasync,
+    "rosasync-leaving": Leaving,
     "afor": AsyncioForRobotics,
 }
 

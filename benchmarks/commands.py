@@ -13,16 +13,23 @@ import typer
 from matplotlib.figure import Figure
 from rich.progress import Progress
 
-from benchmarks import actions, cold, crash, faults, overload, sharing, status
+from benchmarks import actions, cold, crash, faults, goodput, overload, sharing, status
 from benchmarks.pages import replace_section
 from benchmarks.tables import make_console, make_table
-from benchmarks.trials import Goal, Trials, check
+from benchmarks.trials import Goal, Trials
 from rosasync._ros.domain import isolate
 from tests.support.hosts import NoHosts
 
 __all__ = ["add_commands", "save"]
 
 T = TypeVar("T")
+
+PAGES = {
+    overload.COMMAND: "explanation/overload.md",
+    status.COMMAND: "explanation/status.md",
+    goodput.COMMAND: "explanation/status.md",
+}
+"""The pages of commands whose figures are explained elsewhere than in docs/benchmarks.md."""
 
 Json = Annotated[Path | None, typer.Option("--json", help="Write the rows to this file.")]
 Before = Annotated[
@@ -40,6 +47,7 @@ def add_commands(app: typer.Typer) -> None:
     app.command("cold")(start)
     app.command("actions")(act)
     app.command("status")(report_failures)
+    app.command("goodput")(give_up)
     app.command("publish")(publish)
 
 
@@ -67,14 +75,32 @@ def share(
 
 def report_failures(
     calls: Annotated[int, typer.Option(min=10, help="Calls of each kind.")] = 500,
+    json: Json = None,
 ) -> None:
     """How soon a caller learns that the handler has raised, beside an ordinary answer."""
     isolate()
-    found = status.measure(calls)
-    heading = ["handler", "calls", "median ms", "99 % ms", "÷ answered"]
-    make_console().print(make_table("status=True", heading, list(status.rows(found))))
-    median = sorted(found["failed"])[len(found["failed"]) // 2]
-    show_goals([check("seconds from the raise to the error, median", median, "<=", status.TARGET)])
+    trials = Trials(status.COMMAND, {"calls": calls})
+    with collected(trials, None, None, 2, json) as add:
+        found = status.measure(calls, add)
+    make_console().print(make_table("status=True", status.heading, list(status.rows(found))))
+    show_goals(status.goals(found))
+
+
+def give_up(
+    loads: Annotated[
+        str, typer.Option(help="Calls offered, as shares of what the server can do.")
+    ] = goodput.LOADS,
+    seconds: Annotated[float, typer.Option(min=0.1, help="Seconds for each row.")] = 7.0,
+    json: Json = None,
+) -> None:
+    """Callers that give up after a second: the answers in time, with and without status."""
+    with checked():
+        chosen = goodput.plans(split(loads, float))
+    isolate()
+    trials = Trials(goodput.COMMAND, {"seconds": seconds})
+    with collected(trials, goodput.heading, goodput.row, len(chosen), json) as add:
+        cells = goodput.measure(chosen, seconds, add)
+    show_goals(goodput.goals(cells))
 
 
 def overload_server(
@@ -203,11 +229,11 @@ def publish(
 ) -> None:
     """Write saved trials and their plots into the documentation, between their marks.
 
-    Those of ``overload`` go into docs/explanation/overload.md, all others into docs/benchmarks.md.
+    Those of ``overload`` go into docs/explanation/overload.md, those of ``status`` and ``goodput``
+    into docs/explanation/status.md, all others into docs/benchmarks.md.
     """
     for trials in Trials.load(files):
-        explained = trials.command == overload.COMMAND
-        page = out / ("explanation/overload.md" if explained else "benchmarks.md")
+        page = out / PAGES.get(trials.command, "benchmarks.md")
         with checked():
             text = section(trials, out)
             page.write_text(replace_section(page.read_text(), trials.command, text))
@@ -222,10 +248,15 @@ def section(trials: Trials, out: Path) -> str:
         return actions.section(trials)
     if trials.command == crash.COMMAND:
         return crash.section(trials)
+    if trials.command == status.COMMAND:
+        return status.section(trials)
     picture = f"benchmarks/{trials.command}.svg"
     if trials.command == overload.COMMAND:
         save(overload.draw(trials), out / picture)
         return overload.section(trials, f"../{picture}")
+    if trials.command == goodput.COMMAND:
+        save(goodput.draw(trials), out / picture)
+        return goodput.section(trials, f"../{picture}")
     if trials.command == sharing.COMMAND:
         save(sharing.draw(trials), out / picture)
         return sharing.section(trials, picture)

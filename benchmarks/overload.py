@@ -36,11 +36,17 @@ __all__ = [
 ]
 
 COMMAND = "overload"
-SERVERS = {"stock": "stock", "rosasync": "rosasync-plain", "rosasync-async": "rosasync-one"}
+SERVERS = {
+    "stock": "stock",
+    "rosasync": "rosasync-plain",
+    "rosasync-async": "rosasync-one",
+    "rosasync-status": "rosasync-status",
+}
 """The servers, by their keys in `Work.server`. Each works on one request at a time."""
 TIMEOUTS: dict[str, Sequence[float | None]] = {
     "0.1": (0.1,),
     "0.5": (0.5,),
+    "1": (1.0,),
     "2": (2.0,),
     "mixed": (0.1, 0.5, 2.0),
     "none": (None,),

@@ -75,7 +75,14 @@ async def _serve(
     loop = asyncio.get_running_loop()
     async with rosasync.Session("bench_server", bridge=bridge) as session:
         servers = [
-            session.serve(load_type(work.srv_type), name, handler, qos=qos, concurrency=concurrency)
+            session.serve(
+                load_type(work.srv_type),
+                name,
+                handler,
+                qos=qos,
+                concurrency=concurrency,
+                status="status" in kind,
+            )
             for name in work.names
         ]
         ending.append(lambda: loop.call_soon_threadsafe(over.set))

@@ -40,8 +40,11 @@ SERVERS = {
     "rosasync-executor": "executor, async",
 }
 """The bridge, handler and loop of each server of rosasync."""
-LIMITED = {"rosasync-one": "direct, async, one at a time"}
-"""A server for the benchmark of overload alone."""
+LIMITED = {
+    "rosasync-one": "direct, async, one at a time",
+    "rosasync-status": "direct, async, one at a time, status",
+}
+"""Servers for the benchmarks of overload and goodput alone."""
 
 handled: list[float] = []
 """When handlers with `Work.handling` finished requests in this process, on the monotonic clock."""

@@ -18,6 +18,7 @@ from benchmarks import (
     commands,
     crash,
     faults,
+    goodput,
     overload,
     pages,
     profile,
@@ -475,9 +476,42 @@ def test_a_small_run_of_overload() -> None:
     assert all(cell.sent for cell in cells)
 
 
+def test_the_section_of_goodput(tmp_path: Path) -> None:
+    cells = [
+        overload_cell("offered", *pair, 2.0, answered=380 if "status" in pair[1] else 40)
+        for pair in goodput.PAIRS
+    ]
+    assert [goal.met for goal in goodput.goals(cells)] == [True]
+    trials = Trials("goodput", {"seconds": 4.0}, {**MACHINE, "versions": {}}, "2026-11-30")
+    trials.rows = [dataclasses.asdict(cell) for cell in cells]
+    text = commands.section(trials, tmp_path)
+    assert "](../benchmarks/goodput.svg)" in text
+    assert (tmp_path / "benchmarks" / "goodput.svg").exists()
+    assert "| rosasync without status | 2 | 800 | 40 | 0.10 |" in text
+
+
+def test_the_section_of_status(tmp_path: Path) -> None:
+    trials = Trials("status", {"calls": 2}, {**MACHINE, "versions": {}}, "2026-11-30")
+    found = [status.Times("failed", [0.002, 0.004]), status.Times("answered", [0.001, 0.002])]
+    trials.rows = [dataclasses.asdict(times) for times in found]
+    text = commands.section(trials, tmp_path)
+    assert "| failed | 2 | 3.000 | 4.000 | 2.00 |" in text
+    assert "met: 0.003" in text
+
+
+@pytest.mark.slow
+def test_a_small_run_of_goodput() -> None:
+    cells = goodput.measure(goodput.plans([0.5]), 1.0)
+    assert [(cell.client, cell.server) for cell in cells] == list(goodput.PAIRS)
+    assert all(cell.sent for cell in cells)
+
+
 @pytest.mark.slow
 def test_a_small_run_of_status() -> None:
     found = status.measure(10)
-    assert {kind: len(seconds) for kind, seconds in found.items()} == {"failed": 10, "answered": 10}
-    assert all(seconds > 0 for kind in found.values() for seconds in kind)
+    assert [(times.kind, len(times.seconds)) for times in found] == [
+        ("failed", 10),
+        ("answered", 10),
+    ]
+    assert all(seconds > 0 for times in found for seconds in times.seconds)
     assert [row[0] for row in status.rows(found)] == ["failed", "answered"]
