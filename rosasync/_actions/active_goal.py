@@ -52,7 +52,9 @@ class ActiveGoal:
         acceptance: the task that sends the goal and takes the answer; None if it was not sent by
             this session.
         answered: set when `acceptance` has ended, or when the session closes.
-        servers: those that may have the goal; None before its acceptance.
+        servers: those that may have the goal: there when it was sent, or accepted. One may vanish
+            in between.
+        asked: whether its result has been asked for, as it is from the acceptance on.
         outcome: how it has ended.
         settled: set with the outcome.
         ended: set with the outcome, or when the session closes.
@@ -72,6 +74,7 @@ class ActiveGoal:
         "answered",
         "ask_at",
         "ask_delay",
+        "asked",
         "detached",
         "ended",
         "ended_at",
@@ -94,13 +97,14 @@ class ActiveGoal:
         self.status = GoalStatus.UNKNOWN
         self.accepted_at: int | None = None
         self.acceptance: asyncio.Task[None] | None = None
-        self.servers: Servers | None = None
+        self.servers: Servers = frozenset()
         self.outcome: Outcome | None = None
         self.answered = asyncio.Event()
         self.settled = asyncio.Event()
         self.ended = asyncio.Event()
         self.ending: asyncio.Task[None] | None = None
         self.detached = False
+        self.asked = False
         self.ask_at = math.inf
         self.ask_delay = FIRST_ASK
         self.ended_at: float | None = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import enum
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
@@ -368,8 +368,7 @@ class ActionClient:
         """
         self._servers = None
         self._matched = False
-        if self._gone_timer is None and any(map(self._is_lost, self.goals)):
-            self._gone_timer = self._loop.call_later(GONE_DELAY, self._end_lost)
+        self._expect_loss(self.goals)
 
     def close_callers(self, make_error: Callable[[], Exception]) -> None:
         """Let every caller go with an error, because the session closes."""
@@ -470,6 +469,7 @@ class ActionClient:
     def _ask(self, goal: ActiveGoal, room: bool = False) -> None:
         """Ask for the result, now and again at growing intervals."""
         self._results.ask(goal.key, room=room)
+        goal.asked = True
         goal.ask_at = self._loop.time() + goal.ask_delay
         goal.ask_delay = min(2 * goal.ask_delay, LAST_ASK)
 
@@ -526,6 +526,8 @@ class ActionClient:
         """Send a goal and take its answer. A task of its own."""
         request = self._types.SendGoalService.Request(goal=message)
         request.goal_id.uuid = list(goal.key)
+        with suppress(ContextShutdown):
+            goal.servers = self._find_servers_now()
         try:
             response = await client.call(request, timeout=None)
         except Exception as error:
@@ -562,13 +564,14 @@ class ActionClient:
     def _accepted(self, goal: ActiveGoal, stamp: Any) -> None:
         if stamp is not None:
             goal.accepted_at = stamp.sec * 1_000_000_000 + stamp.nanosec
-        if goal.servers is None:
+        if not goal.asked:
             goal.update(GoalStatus.ACCEPTED)
-            with suppress(ContextShutdown):
-                goal.servers = self._find_servers()
             if goal.trace is not None:
                 goal.trace.enter("accepted")
             self._ask(goal, room=stamp is not None)
+            with suppress(ContextShutdown):
+                goal.servers |= self._find_servers_now()
+                self._expect_loss((goal,))
         goal.answered.set()
 
     def _rejected(self, goal: ActiveGoal) -> None:
@@ -668,14 +671,26 @@ class ActionClient:
             self._servers = self._node.queries.find_servers(self.action.get_result)
         return self._servers
 
+    def _find_servers_now(self) -> Servers:
+        """As `_find_servers`, but never from before a change that the graph has not reported."""
+        if not self._node.graph_events:
+            self._servers = None
+        return self._find_servers()
+
     def _has_one_server(self) -> bool:
         with suppress(ContextShutdown):
             return len(self._find_servers()) <= 1
         return True
 
     def _is_lost(self, goal: ActiveGoal) -> bool:
-        """Return whether every server that may have the goal has vanished."""
-        return bool(goal.servers) and not (goal.servers or set()) & self._find_servers()
+        """Return whether every server that may have an accepted goal has vanished."""
+        servers = goal.servers
+        return goal.asked and bool(servers) and servers.isdisjoint(self._find_servers())
+
+    def _expect_loss(self, goals: Iterable[ActiveGoal]) -> None:
+        """End those of the goals that are lost, unless their results arrive in a moment."""
+        if self._gone_timer is None and any(map(self._is_lost, goals)):
+            self._gone_timer = self._loop.call_later(GONE_DELAY, self._end_lost)
 
     def _end_lost(self) -> None:
         self._gone_timer = None
