@@ -38,7 +38,12 @@ def test_list_hidden() -> None:
 def test_type_and_find() -> None:
     assert rosasync("type", LAMP).stdout == f"{LAMP_TYPE}\n"
     assert LAMP in rosasync("find", LAMP_TYPE).stdout.splitlines()
-    assert json_lines(rosasync("find", "nav_msgs/srv/GetMap", "--json").stdout) == []
+    none = rosasync("find", "nav_msgs/srv/GetMap", "--json")
+    assert (none.returncode, none.stdout) == (3, "")
+    assert "no service of the type nav_msgs/srv/GetMap" in none.stderr
+    wrong = rosasync("find", f"{LAMP_TYPE}l")
+    assert (wrong.returncode, wrong.stdout) == (2, "")
+    assert f"did you mean '{LAMP_TYPE}'" in wrong.stderr
     missing = rosasync("type", "/lamp/swich", "--timeout", "1")
     assert (missing.returncode, missing.stdout) == (3, "")
     assert f"there are {LAMP} ({LAMP_TYPE})" in missing.stderr

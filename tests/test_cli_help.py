@@ -51,8 +51,19 @@ def test_without_arguments_it_prints_the_help() -> None:
     assert rosasync().stdout == rosasync("--help").stdout
 
 
-@pytest.mark.parametrize("arguments", [("nonsense",), ("call",), ("list", "--nonsense")])
-def test_bad_usage_is_one_line_and_imports_no_rclpy(arguments: tuple[str, ...]) -> None:
+@pytest.mark.parametrize(
+    ("arguments", "advice"),
+    [
+        (("nonsense",), "--help"),
+        (("call",), "--help"),
+        (("list", "--nonsense"), "--help"),
+        (("call", "/lamp/switch", "std_srvs/srv/SetBool", "data:", "true"), "needs quotes"),
+        (("list", "data:"), "--help"),
+    ],
+)
+def test_bad_usage_is_one_line_and_imports_no_rclpy(
+    arguments: tuple[str, ...], advice: str
+) -> None:
     code = (
         f"import sys; sys.argv[1:] = {arguments!r}; sys.modules['rclpy'] = None\n"
         "from rosasync._cli.app import main\n"
@@ -63,7 +74,7 @@ def test_bad_usage_is_one_line_and_imports_no_rclpy(arguments: tuple[str, ...]) 
     )
     assert (done.returncode, done.stdout) == (0, "")
     assert done.stderr.count("\n") == 1
-    assert "--help" in done.stderr
+    assert advice in done.stderr
 
 
 @pytest.mark.slow

@@ -57,6 +57,16 @@ class TestParam:
         [line] = (await printed("param", "list", node, "--json")).splitlines()
         assert json.loads(line) == {"node": node, "parameters": names}
 
+    async def test_a_node_that_is_not_there(self, nodes: NodesProcess) -> None:
+        node = await nodes.add("parameters", "arm")
+        done = await run("param", "get", f"{node}m", "bool", "--timeout", "3")
+        assert (done.returncode, done.stdout) == (3, "")
+        assert f"{node}m: no node of this name after" in done.stderr
+        assert f"; there are {node}" in done.stderr
+        done = await run("lifecycle", "get", node, "--timeout", "3")
+        assert (done.returncode, done.stdout) == (3, "")
+        assert f"{node}: this node has no lifecycle" in done.stderr
+
     async def test_list_of_all_nodes(self, nodes: NodesProcess) -> None:
         node = await nodes.add("unset")
         assert f"{node}:\n  first\n  last\n" in await printed("param", "list")
@@ -151,7 +161,7 @@ class TestParam:
             (("set", node, "mode", "off"), 1, "no such mode: off"),
             (("set", node, "integer", str(2**63)), 2, "out of the range of int64"),
             (("load", node, str(tmp_path / "none.yaml")), 2, "No such file"),
-            (("get", "/absent", "a", "--timeout", str(TICK)), 3, "/absent/get_parameters"),
+            (("get", "/absent", "a", "--timeout", str(TICK)), 3, "/absent"),
             (("get", node), 2, "NAME"),
         ):
             done = await run("param", *arguments)
@@ -298,7 +308,7 @@ class TestLifecycle:
             (("set", failing, "configure"), 1, "its callback failed; it is unconfigured as before"),
             (("set", failing, "activate"), 1, "it is unconfigured"),
             (("set", failing, "explode"), 2, "'transition': 'explode' is not one of"),
-            (("get", "/absent", "--timeout", str(TICK)), 3, "/absent/get_state"),
+            (("get", "/absent", "--timeout", str(TICK)), 3, "/absent"),
             (("set", slow, "configure", "--timeout", str(60 * TICK)), 4, "(unknown)"),
         ):
             done = await run("lifecycle", *arguments)

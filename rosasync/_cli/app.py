@@ -87,6 +87,9 @@ def _line_of(error: Any) -> str:
     command = error.ctx.command_path if error.ctx else "rosasync"
     # Newer versions of click say so of a value that is not one of the choices.
     text = " ".join(error.format_message().split()).replace("Value error, ", "")
+    takes_yaml = error.ctx and any(p.metavar == "YAML" for p in error.ctx.command.params)
+    if takes_yaml and "unexpected extra argument" in text:
+        return join(text, "YAML with spaces needs quotes: '{data: true}'")
     return join(text, f"Try: {command} --help")
 
 

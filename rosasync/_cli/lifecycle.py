@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from rosasync._cli.errors import CliError, Code
-from rosasync._cli.node_names import NodeName, ask_each, nodes_that_serve
+from rosasync._cli.node_names import NodeName, ask_each, nodes_that_serve, session_for
 from rosasync._cli.options import AsJson, Timeout, Wait
 from rosasync._cli.output import print_json
 from rosasync._cli.run import open_session, run
@@ -100,12 +100,12 @@ async def _nodes(timeout: float, wait: float | None, as_json: bool) -> int:
 
 
 async def _get(node: str, timeout: float, as_json: bool) -> None:
-    async with open_session(timeout) as session:
+    async with session_for(node, timeout) as session:
         _print_state(node, await LifecycleClient(session, node).state(), as_json)
 
 
 async def _list(node: str, timeout: float, as_json: bool) -> None:
-    async with open_session(timeout) as session:
+    async with session_for(node, timeout) as session:
         found = await LifecycleClient(session, node).transitions()
     for one in found:
         if as_json:
@@ -115,7 +115,7 @@ async def _list(node: str, timeout: float, as_json: bool) -> None:
 
 
 async def _set(node: str, transition: Transition, timeout: float, as_json: bool) -> None:
-    async with open_session(timeout) as session:
+    async with session_for(node, timeout) as session:
         change = getattr(LifecycleClient(session, node), transition)
         try:
             _print_state(node, await change(), as_json)

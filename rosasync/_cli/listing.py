@@ -14,6 +14,7 @@ from rosasync._cli.graph import (
     no_server,
     resolve,
     settle,
+    srv_class,
     wait_for_types,
 )
 from rosasync._cli.options import AsJson, Hidden, Name, Type, Wait
@@ -92,15 +93,20 @@ def find(
     run(_find(srv_type, hidden, as_json, wait))
 
 
-async def _find(srv_type: str, hidden: bool, as_json: bool, wait: float | None) -> None:
+async def _find(srv_type: str, hidden: bool, as_json: bool, wait: float | None) -> int:
     found = await _services(wait)
-    for name in sorted(name for name, types in found.items() if srv_type in types):
-        if is_hidden(name) and not hidden:
-            continue
+    names = [n for n in sorted(found) if srv_type in found[n] and (hidden or not is_hidden(n))]
+    if not names:
+        # Raises if there is no such type, or it is not installed, so that it may be misspelt.
+        srv_class(srv_type)
+        note(f"no service of the type {srv_type}. Try: rosasync list -t")
+        return Code.NO_SERVER
+    for name in names:
         if as_json:
             print_json({"name": name})
         else:
             print(name)
+    return Code.ANSWERED
 
 
 def info(name: Name, as_json: AsJson = False, wait: Wait = None) -> None:

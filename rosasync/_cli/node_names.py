@@ -3,22 +3,64 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Iterable
+import difflib
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
+from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from typing import Annotated, Generic, TypeVar
 
 import typer
 
 import rosasync
-from rosasync._cli.errors import Code, code_of, code_of_all
+from rosasync._cli.errors import CliError, Code, code_of, code_of_all
 from rosasync._cli.graph import is_hidden, settle
-from rosasync._cli.run import fail
+from rosasync._cli.run import fail, open_session
+from rosasync._core.text import duration
 
-__all__ = ["Answers", "NodeName", "ask_each", "nodes_that_serve"]
+__all__ = ["Answers", "NodeName", "ask_each", "nodes_that_serve", "session_for"]
 
 T = TypeVar("T")
 
 NodeName = Annotated[str, typer.Argument(metavar="NODE", help="The node's name, /arm.")]
+
+
+@asynccontextmanager
+async def session_for(node: str | None, timeout: float) -> AsyncIterator[rosasync.Session]:
+    """Open a session to ask one node; if it lacks a service, the error is about the node.
+
+    Args:
+        node: the node's name, as the user gave it; None if all nodes are asked.
+        timeout: the session's.
+
+    Raises:
+        CliError: the node is not there, or does not have what it is asked for.
+    """
+    async with open_session(timeout) as session:
+        try:
+            yield session
+        except rosasync.ServiceUnavailable as error:
+            text = str(error)
+            if node is None or "no server has this name" not in text or "no other node" in text:
+                raise
+            raise _explain_missing(session, node, error) from None
+
+
+def _explain_missing(
+    session: rosasync.Session, node: str, error: rosasync.ServiceUnavailable
+) -> CliError:
+    from rosasync._ros.inspect import node_names
+
+    names = [name for name in node_names(session.node) if not is_hidden(name)]
+    resolved = error.srv_name.rpartition("/")[0]
+    if resolved not in names:
+        similar = difflib.get_close_matches(resolved, names, n=3)
+        instead = f"; there are {', '.join(similar)}" if similar else ""
+        text = f"no node of this name after {duration(error.elapsed)}{instead}. Try: rosasync nodes"
+    elif error.srv_type.startswith("lifecycle_msgs/"):
+        text = "this node has no lifecycle. Try: rosasync lifecycle nodes"
+    else:
+        text = f"this node has no service {error.srv_name}: its parameters cannot be reached"
+    return CliError(f"{node}: {text}", Code.NO_SERVER)
 
 
 async def nodes_that_serve(

@@ -11,11 +11,11 @@ from typing import Annotated, Any
 import typer
 
 from rosasync._cli.errors import CliError, Code
-from rosasync._cli.node_names import NodeName, ask_each, nodes_that_serve
+from rosasync._cli.node_names import NodeName, ask_each, nodes_that_serve, session_for
 from rosasync._cli.options import AsJson, Timeout, Wait
 from rosasync._cli.output import print_json, print_value
 from rosasync._cli.param_values import read_value
-from rosasync._cli.run import open_session, run
+from rosasync._cli.run import run
 from rosasync.parameters import ParameterClient, ParameterError, ParameterType
 
 __all__ = ["app"]
@@ -149,7 +149,7 @@ def load(
 
 
 async def _list(node: str | None, timeout: float, wait: float | None, as_json: bool) -> int:
-    async with open_session(timeout) as session:
+    async with session_for(node, timeout) as session:
         if node is not None:
             _print_names(node, await ParameterClient(session, node).list(), as_json, alone=True)
             return Code.ANSWERED
@@ -173,14 +173,14 @@ def _print_names(node: str, names: list[str], as_json: bool, *, alone: bool) -> 
 
 
 async def _get(node: str, names: list[str], timeout: float, as_json: bool) -> None:
-    async with open_session(timeout) as session:
+    async with session_for(node, timeout) as session:
         values = _plain(await ParameterClient(session, node).get(names))
     one = len(names) == 1 and not as_json
     print_value(values[names[0]] if one else values, as_json=as_json)
 
 
 async def _set(node: str, name: str, text: str, timeout: float, as_json: bool) -> None:
-    async with open_session(timeout) as session:
+    async with session_for(node, timeout) as session:
         client = ParameterClient(session, node)
         kind = await _static_type(client, name)
         with _usage_errors():
@@ -200,14 +200,14 @@ async def _static_type(client: ParameterClient, name: str) -> ParameterType:
 
 
 async def _delete(node: str, name: str, timeout: float, as_json: bool) -> None:
-    async with open_session(timeout) as session:
+    async with session_for(node, timeout) as session:
         await ParameterClient(session, node).set(name, None)
     if as_json:
         print_json({"node": node, "deleted": name})
 
 
 async def _describe(node: str, names: list[str], timeout: float, as_json: bool) -> None:
-    async with open_session(timeout) as session:
+    async with session_for(node, timeout) as session:
         found = await ParameterClient(session, node).describe(names)
     for position, descriptor in enumerate(found.values()):
         fields = asdict(descriptor) | {"type": descriptor.type.name.lower()}
@@ -215,7 +215,7 @@ async def _describe(node: str, names: list[str], timeout: float, as_json: bool) 
 
 
 async def _dump(node: str, timeout: float, as_json: bool) -> None:
-    async with open_session(timeout) as session:
+    async with session_for(node, timeout) as session:
         client = ParameterClient(session, node)
         if not as_json:
             print(await client.dump(), end="")
@@ -225,7 +225,7 @@ async def _dump(node: str, timeout: float, as_json: bool) -> None:
 
 
 async def _load(node: str, file: Path, use_wildcard: bool, timeout: float, as_json: bool) -> None:
-    async with open_session(timeout) as session:
+    async with session_for(node, timeout) as session:
         with _usage_errors():
             values = await ParameterClient(session, node).load(file, use_wildcard=use_wildcard)
     print_value(_plain(values), as_json=as_json)
