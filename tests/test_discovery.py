@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import os
 import socket
+import struct
 from collections.abc import Iterator
 
 import pytest
@@ -69,6 +70,25 @@ async def test_switched_off(listener: socket.socket, monkeypatch: pytest.MonkeyP
     async with rosasync.Session():
         await asyncio.to_thread(listener.recv, 1 << 16, socket.MSG_PEEK)
         assert introductions(listener) == []
+
+
+def test_one_that_uses_multicast_introduces_itself_to_the_network(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    loopback = socket.if_nametoindex(discovery.LOOPBACK)
+    monkeypatch.setattr(socket, "if_nameindex", lambda: [(loopback, "eth0"), (10_000, "gone")])
+    with (
+        socket.socket(type=socket.SOCK_DGRAM) as group,
+        socket.socket(type=socket.SOCK_DGRAM) as own,
+    ):
+        group.bind(("", discovery.multicast_port(domain())))
+        member = struct.pack("=4s4xi", socket.inet_aton(discovery.MULTICAST), loopback)
+        group.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, member)
+        port = discovery.ports_of(domain())[-1]
+        with discovery.introduced(domain()):
+            own.bind(("", port))
+        [packet] = introductions(group)
+    assert port.to_bytes(4, "little") + bytes(12) in packet
 
 
 def test_without_a_new_participant_nothing_is_sent(listener: socket.socket) -> None:

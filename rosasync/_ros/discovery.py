@@ -1,8 +1,9 @@
-"""Asks the participants on this host to announce themselves again, once this one listens.
+"""Asks the other participants to announce themselves again, once this one listens.
 
 A participant of Fast DDS announces itself before it listens (``RTPSParticipantImpl::enable`` starts
 the builtin protocols, then registers the receivers). A process on the same host answers within a
 millisecond, so about half of all answers are lost, and the next announcement comes up to 3 s later.
+In a fast network it is the same, but rarer.
 More announcements do not help: a participant answers only one that it does not know yet.
 
 So this module introduces a participant that exists for a second and has no endpoints. Its address
@@ -18,13 +19,15 @@ import struct
 from collections.abc import Iterator
 from pathlib import Path
 
-__all__ = ["introduced", "introduction", "own_ports", "ports_of", "udp_sockets"]
+__all__ = ["introduced", "introduction", "multicast_port", "own_ports", "ports_of", "udp_sockets"]
 
 LEASE = 1
 """Seconds until the other participants forget the one that is introduced."""
 PARTICIPANTS = 32
 """Participants of a domain on one host that are asked: as many as Fast DDS looks for itself."""
-LOCALHOST = "127.0.0.1"
+LOCALHOST, LOOPBACK = "127.0.0.1", "lo"
+MULTICAST = "239.255.0.1"
+"""The group in which participants announce themselves to the network."""
 
 # Ports and parameters of the RTPS specification, 2.3: sections 9.6.1 and 9.6.2.2.
 BASE, DOMAIN_GAIN, UNICAST, PARTICIPANT_GAIN = 7400, 250, 10, 2
@@ -38,23 +41,32 @@ DATA, LITTLE_ENDIAN_WITH_DATA = 0x15, 0x05
 
 @contextlib.contextmanager
 def introduced(domain: int) -> Iterator[None]:
-    """Let the participants on this host announce themselves to one that is made in the block.
+    """Let the other participants announce themselves to one that is made in the block.
 
-    Sends 31 packets on the loopback device, in about 1 ms.
+    Sends 31 packets on the loopback device, in about 1 ms. If the participant uses multicast, also
+    one on each device to other hosts.
     """
     before = own_ports(domain)
     yield
     for port in own_ports(domain) - before:
-        _introduce(domain, port)
+        _introduce_on_host(domain, port)
+        if multicast_port(domain) in _own_udp_ports():
+            for index, name in socket.if_nameindex():
+                if name != LOOPBACK:
+                    _introduce_on_network(domain, port, index)
 
 
 def own_ports(domain: int) -> set[int]:
     """Return the ports on which this process's participants of the domain listen."""
-    sockets, ports = _own_sockets(), ports_of(domain)
-    return {port for port, inode in udp_sockets() if inode in sockets and port in ports}
+    return _own_udp_ports() & {*ports_of(domain)}
 
 
-def _introduce(domain: int, port: int) -> None:
+def multicast_port(domain: int) -> int:
+    """Return the port on which participants listen for what is sent to all of the domain."""
+    return BASE + DOMAIN_GAIN * domain
+
+
+def _introduce_on_host(domain: int, port: int) -> None:
     packet = introduction(domain, port)
     with contextlib.suppress(OSError), socket.socket(type=socket.SOCK_DGRAM) as sender:
         for other in ports_of(domain):
@@ -62,10 +74,20 @@ def _introduce(domain: int, port: int) -> None:
                 sender.sendto(packet, (LOCALHOST, other))
 
 
-def introduction(domain: int, port: int) -> bytes:
+def _introduce_on_network(domain: int, port: int, device: int) -> None:
+    # An error means that the device is down or has no address.
+    with contextlib.suppress(OSError), socket.socket(type=socket.SOCK_DGRAM) as sender:
+        by_index = struct.pack("=8xi", device)
+        sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, by_index)
+        sender.connect((MULTICAST, multicast_port(domain)))
+        # Another participant each time: the answer has to go to the address on this device.
+        sender.send(introduction(domain, port, sender.getsockname()[0]))
+
+
+def introduction(domain: int, port: int, address: str = LOCALHOST) -> bytes:
     """Return the announcement of a new participant that listens at a port of this host."""
     prefix = os.urandom(12)
-    locator = struct.pack("<iI12x", 1, port) + socket.inet_aton(LOCALHOST)
+    locator = struct.pack("<iI12x", 1, port) + socket.inet_aton(address)
     parameters = {
         PROTOCOL: VERSION + bytes(2),
         VENDOR: EPROSIMA + bytes(2),
@@ -98,9 +120,9 @@ def udp_sockets() -> Iterator[tuple[int, str]]:
             yield int(fields[1].rpartition(":")[2], 16), fields[9]
 
 
-def _own_sockets() -> set[str]:
+def _own_udp_ports() -> set[int]:
     names = set()
     for descriptor in Path("/proc/self/fd").glob("*"):
         with contextlib.suppress(OSError):
             names.add(os.readlink(descriptor))
-    return {name[len("socket:[") : -1] for name in names if name.startswith("socket:[")}
+    return {port for port, inode in udp_sockets() if f"socket:[{inode}]" in names}
