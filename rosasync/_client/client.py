@@ -185,10 +185,10 @@ class Client:
             self.owner.on_places()
         self.set_timer()
 
-    def on_servers(self, servers: Servers) -> None:
+    def on_servers(self, servers: Servers, ended: Servers = frozenset()) -> None:
         """Set the servers that later requests get, and free the places of older requests."""
         self.servers = servers
-        self.window.on_servers(servers, self._loop.time())
+        self.window.on_servers(servers, self._loop.time(), ended)
         self.set_timer()
 
     def lose_servers(self, servers: Servers, error: Callable[[], Exception]) -> None:

@@ -187,11 +187,11 @@ class Clients:
             except PortDestroyed:
                 self.drop(client)
 
-    def on_servers(self, servers: Servers) -> None:
+    def on_servers(self, servers: Servers, ended: Servers = frozenset()) -> None:
         """React to the servers of a new generation, before anything is sent in it."""
         self._listener.on_servers(servers)
         for client in self._clients:
-            client.on_servers(servers)
+            client.on_servers(servers, ended)
 
     def lose_servers(self, servers: Servers) -> None:
         """End the requests that no server has, or let them go on; ``servers`` are those left."""

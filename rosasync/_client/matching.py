@@ -27,8 +27,11 @@ LEASE = 20
 class MatchingOwner(Protocol):
     """What a matching needs to know of the service's clients, and reports to them."""
 
-    def on_servers(self, servers: Servers) -> None:
-        """React to the servers of a new generation, before anything is sent in it."""
+    def on_servers(self, servers: Servers, ended: Servers) -> None:
+        """React to the servers of a new generation, before anything is sent in it.
+
+        ``ended`` are those of them whose process has crashed, if others have come.
+        """
 
     def lose_servers(self, servers: Servers) -> None:
         """End the requests that no server has, or let them go on; ``servers`` are those left."""
@@ -128,8 +131,12 @@ class Matching:
 
     def _learn(self) -> None:
         self._generation = self._watch.generation
-        self.servers = self._queries.find_servers(self._service)
-        self._owner.on_servers(self.servers)
+        before, self.servers = self.servers, self._queries.find_servers(self._service)
+        ended: Servers = frozenset()
+        # That is expensive to know, and of use only if a successor is there.
+        if before and self.servers - before:
+            ended = self._queries.find_ended(before & self.servers)
+        self._owner.on_servers(self.servers, ended)
 
     def _end_later(self) -> None:
         answers = self._owner.count_answers()

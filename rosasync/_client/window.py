@@ -43,7 +43,8 @@ class Window:
     gone. If a server has come that has not had it, and none of the requests of this kind is
     answered for the time of the patience, then the old server is taken for dead, and all of them
     give their places back at once. Not sooner: if the old server lives, the requests for the new
-    one go to both, and would push these out of the old one's queue.
+    one go to both, and would push these out of the old one's queue. If the process of the old
+    server has certainly ended, nothing is waited for.
 
     Attributes:
         size: the number of places.
@@ -229,10 +230,16 @@ class Window:
             leaving.popleft()
         return sent
 
-    def on_servers(self, servers: Servers, now: float) -> None:
+    def on_servers(self, servers: Servers, now: float, ended: Servers = frozenset()) -> None:
         """Free the places of the abandoned requests that one of these servers has not had.
 
         Requests whose servers are not known yet have gone to these.
+
+        Args:
+            servers: the servers that the graph shows.
+            now: the time.
+            ended: those of them whose process has ended; also requests that are waited for give
+                their places back if no other server has had them.
         """
         came = servers - self.servers
         self.servers = servers
@@ -245,7 +252,7 @@ class Window:
                 sent.servers = servers
             elif not sent.place or servers <= sent.servers:
                 continue
-            elif sent.number in self.abandoned:
+            elif sent.number in self.abandoned or _all_in(sent.servers & servers, ended):
                 self._free(sent)
             elif came:
                 self._outdated[sent.number] = sent
@@ -316,6 +323,11 @@ class Window:
         if sent.place:
             sent.place = False
             self.taken -= 1
+
+
+def _all_in(had: Servers, ended: Servers) -> bool:
+    """Return whether there is a server that had a request, and all of them have ended."""
+    return bool(had) and had <= ended
 
 
 def _yields(resend: Sent | None) -> bool:

@@ -27,6 +27,7 @@ from rosasync import (
     SessionClosed,
     UsageError,
 )
+from rosasync._client import response_times
 from rosasync.testing._memory.graph import MemoryNode, MemoryQueries
 from rosasync.testing._memory.services import MemoryClient
 from tests.support.fake_graph import FakeGraph
@@ -569,6 +570,26 @@ async def test_servers_that_have_crashed_do_not_count_as_several(
             fake_graph.serve(Echo, "/echo", echo)
             assert await ask(session, 2) == 2
     assert [message.partition(" answer")[0] for message in caplog.messages] == ["/echo: 2 servers"]
+
+
+async def test_a_call_goes_to_the_successor_of_a_server_that_has_crashed(
+    fake_graph: FakeGraph, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It does not wait for the calls that are out at the old one."""
+    monkeypatch.setattr(response_times, "PATIENCE_INITIAL", 1_000.0)
+    first = fake_graph.serve(Echo, "/echo", echo)
+    crashed = frozenset({first.identity})
+    monkeypatch.setattr(MemoryQueries, "find_ended", lambda node, servers: crashed & servers)
+    async with opened(fake_graph, Limits(in_flight=2)) as session:
+        with fake_graph.drop_requests():
+            out = [asyncio.create_task(ask(session, number)) for number in range(2)]
+            await until(lambda: session.pool.statistics().in_flight == 2)
+        waiting = asyncio.create_task(ask(session, 2))
+        await until(lambda: session.pool.statistics().waiting == 1)
+        fake_graph.serve(Echo, "/echo", echo)
+        assert await waiting == 2
+        for call in out:
+            call.cancel()
 
 
 async def test_a_storm_leaves_nothing(fake_graph: FakeGraph) -> None:

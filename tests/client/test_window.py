@@ -24,8 +24,8 @@ class Bench:
         self.now = 0.0
         self.see(servers)
 
-    def see(self, servers: str) -> None:
-        self.window.on_servers(frozenset(servers), self.now)
+    def see(self, servers: str, ended: str = "") -> None:
+        self.window.on_servers(frozenset(servers), self.now, frozenset(ended))
 
     def send(self, count: int = 1, *, leased: bool = False, servers: str | None = None) -> Sent:
         """Send requests of callers that wait, and return the last one."""
@@ -315,6 +315,18 @@ class TestSentAgain:
         if leased:
             bench.window.lease()
         return bench, bench.send(leased=leased)
+
+
+@pytest.mark.parametrize(("ended", "free"), [("", 0), ("A", 1), ("AB", 3)])
+def test_requests_at_servers_that_have_ended_take_no_place_beside_a_new_one(
+    ended: str, free: int
+) -> None:
+    bench = Bench()
+    bench.send()
+    bench.see("AB")
+    bench.send(2)
+    bench.see("ABC", ended)
+    assert bench.window.free == free
 
 
 def test_what_each_server_has() -> None:
