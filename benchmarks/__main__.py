@@ -11,13 +11,14 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from benchmarks.allocations import measure_allocations, show_allocations
+from benchmarks.allocations import measure_allocations
 from benchmarks.commands import add_commands, save
 from benchmarks.machine import describe_machine
 from benchmarks.results import Results
 from benchmarks.runner import Runner
 from benchmarks.suites import SUITES, make_suite
-from benchmarks.tables import make_console, scenario_table, target_table
+from benchmarks.tables import goal_table, make_console, scenario_table
+from benchmarks.targets import judge
 from rosasync._ros.domain import isolate
 
 ROUNDS, QUICK_ROUNDS, ALLOCATION_ROUNDS = 9, 5, 3
@@ -73,7 +74,7 @@ def allocations(quick: Quick = False, rounds: Rounds = None, json: Json = None) 
     isolate()
     rounds = rounds or (1 if quick else ALLOCATION_ROUNDS)
     settings = {"suites": ["allocations"], "quick": quick, "rounds": rounds, "pin": False}
-    results = Results(describe_machine(), settings)
+    results = Results(settings)
     look_at_allocations(results, quick, rounds)
     finish(results, json)
 
@@ -131,7 +132,7 @@ def report(
     """Write docs/benchmarks.md and its plots from saved results."""
     from benchmarks.report import write_report
 
-    typer.echo(write_report(Results.load(files), out))
+    typer.echo(write_report(Results.read(files), out))
 
 
 def measure(
@@ -154,7 +155,7 @@ def measure(
     rounds = rounds or (QUICK_ROUNDS if quick else ROUNDS)
     pin = len(os.sched_getaffinity(0)) >= PINNED_CORES if pin is None else pin
     settings = {"suites": suites, "quick": quick, "rounds": rounds, "pin": pin}
-    results = Results(describe_machine(), settings)
+    results = Results(settings)
     console = make_console()
     try:
         with (
@@ -184,11 +185,8 @@ def show(console: Console, results: Results) -> None:
     for scenario in results.scenarios:
         if results.contestants(scenario):
             console.print(scenario_table(results, scenario))
-    for table in show_allocations(results):
-        console.print(table)
-    targets = target_table(results)
-    if targets:
-        console.print(targets)
+    if found := goal_table(judge(results)):
+        console.print(found)
 
 
 if __name__ == "__main__":

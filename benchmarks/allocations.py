@@ -17,22 +17,20 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import AsyncExitStack, ExitStack, contextmanager
 from functools import partial
-from statistics import median
 from typing import Any, Literal
 
-from rich.box import SIMPLE
 from rich.progress import Progress
-from rich.table import Table
 
 import rosasync
 from benchmarks.contestants.base import spinning
 from benchmarks.meter import resident_bytes
-from benchmarks.results import Results
+from benchmarks.results import Results, Turn
+from benchmarks.runner import Scenario
 from benchmarks.server import Server, WorkServer
 from benchmarks.work import READY_TIMEOUT, Work, load_type, make_request
 from tests.support.child import Child, serve_commands
 
-__all__ = ["allocation_rows", "measure_allocations", "show_allocations"]
+__all__ = ["measure_allocations"]
 
 OUT = 200
 """Number of outstanding calls while their memory is counted; each lasts ``SLOW`` seconds."""
@@ -42,20 +40,11 @@ WARM = 10_000
 CALLS, QUICK_CALLS = 100_000, 20_000
 PATIENCE = 300.0
 
-CLIENTS = {
-    "direct": "rosasync, direct bridge",
-    "executor": "rosasync, executor bridge",
-    "call": "client.call (call_async for calls at once)",
-}
-SERVED = {
-    "rosasync": "rosasync, async handler",
-    "rosasync-plain": "rosasync, plain handler",
-    "stock-async": "stock rclpy, async handler",
-    "stock": "stock rclpy, plain handler",
-}
+CLIENTS = ("direct", "executor", "call")
+"""Their keys; ``call`` is `call_async` for calls at once."""
+SERVED = ("rosasync", "rosasync-plain", "stock-async", "stock")
 
 Row = dict[str, float]
-Found = dict[str, dict[str, Row]]
 
 
 class Caller(ABC):
@@ -234,19 +223,21 @@ def measure_allocations(results: Results, *, quick: bool, rounds: int, progress:
     """Measure every client and server, each in its own process, once in each round."""
     calls = QUICK_CALLS if quick else CALLS
     task = progress.add_task("", total=rounds * (len(CLIENTS) + len(SERVED)))
-    for _ in range(rounds):
-        found: Found = {"clients": {}, "servers": {}}
+    for number in range(rounds):
         for part, kinds, measure in (
             ("clients", CLIENTS, _measure_client),
             ("servers", SERVED, _measure_server),
         ):
-            for number, kind in enumerate(kinds):
+            key = f"allocations, {part}"
+            scenario = Scenario(key, key, kinds, action="allocate", metric="peak")
+            results.scenarios[key] = scenario.to_json()
+            for kind in kinds:
                 progress.update(task, description=f"{part}: {kind}")
-                name = f"/{part}_{number}"
+                name = f"/{part}_{kind.replace('-', '_')}"
                 work = Work(server="lean", services=2, delays=(0.0, SLOW), srv_name=name)
-                found[part][kind] = measure(kind, work, calls)
+                found = measure(kind, work, calls)
+                results.turns.append(Turn(key, kind, number, "ok", added=found))
                 progress.advance(task)
-        results.allocations.append(found)
 
 
 def _measure_client(kind: str, work: Work, calls: int) -> Row:
@@ -290,45 +281,6 @@ def _look(subject: Child, call: Callable[..., Any], calls: int) -> Row:
         "growth": (after["resident"] - before["resident"]) / 1e6,
         "pending": after["pending"],
     }
-
-
-COLUMNS: dict[str, tuple[str, str]] = {
-    "blocks": ("blocks held by an outstanding call", "{:.1f}"),
-    "bytes": ("bytes held by it", "{:,.0f}"),
-    "peak": ("bytes at the peak", "{:,.0f}"),
-    "kept_blocks": ("blocks kept", "{:+,.0f}"),
-    "growth": ("growth, MB", "{:+.2f}"),
-    "pending": ("pending", "{:.0f}"),
-}
-
-
-def allocation_rows(results: Results, part: str) -> tuple[list[str], list[list[str]]]:
-    """Return the heading and the rows for ``clients`` or ``servers``: medians over the rounds."""
-    labels = CLIENTS if part == "clients" else SERVED
-    found = [measured[part] for measured in results.allocations]
-    keys = [key for key in COLUMNS if any(key in row for row in found[0].values())]
-    if part == "servers":
-        keys.remove("pending")
-    body = [
-        [
-            labels[kind],
-            *(COLUMNS[key][1].format(median(kinds[kind][key] for kinds in found)) for key in keys),
-        ]
-        for kind in found[0]
-    ]
-    return ["", *(COLUMNS[key][0] for key in keys)], body
-
-
-def show_allocations(results: Results) -> Iterator[Table]:
-    """Return a table for the clients and one for the servers."""
-    for part in results.allocations[0] if results.allocations else ():
-        heading, body = allocation_rows(results, part)
-        table = Table(title=f"[bold]{part}[/]", title_justify="left", box=SIMPLE)
-        for number, name in enumerate(heading):
-            table.add_column(name, justify="right" if number else "left")
-        for row in body:
-            table.add_row(*row)
-        yield table
 
 
 def main() -> None:

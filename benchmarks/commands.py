@@ -15,7 +15,7 @@ from rich.progress import Progress
 
 from benchmarks import actions, cold, crash, faults, goodput, overload, sharing, status
 from benchmarks.pages import replace_section
-from benchmarks.tables import make_console, make_table
+from benchmarks.tables import goal_table, make_console, make_table
 from benchmarks.trials import Goal, Trials
 from rosasync._ros.domain import isolate
 from tests.support.hosts import NoHosts
@@ -312,9 +312,8 @@ def collected(
 
 
 def show_goals(goals: Iterable[Goal]) -> None:
-    body = [goal.row() for goal in goals if goal.met is not None]
-    if body:
-        make_console().print(make_table("goals", ["", "outcome"], body))
+    if found := goal_table(goals):
+        make_console().print(found)
 
 
 def split(text: str, kind: Callable[[str], T] = str) -> list[T]:  # type: ignore[assignment]

@@ -15,7 +15,7 @@ from benchmarks.contestants.base import ANSWERED, LoggedCall
 from benchmarks.pages import markdown_table
 from benchmarks.server import WorkServer
 from benchmarks.sharing import older
-from benchmarks.trials import Goal, Trials, check
+from benchmarks.trials import GOALS, Goal, Trials, check
 from benchmarks.work import Work
 from tests.support.child import Child
 from tests.support.lossy import LossyHosts
@@ -379,7 +379,7 @@ def section(trials: Trials) -> str:
             "## Faults\n",
             f"`python -m benchmarks faults`. {_sentence(trials)}\n",
             f"{trials.conditions}\n",
-            markdown_table(["goal", "outcome"], [goal.row() for goal in goals(faults)]),
+            markdown_table(GOALS, [goal.row() for goal in goals(faults)]),
             markdown_table(heading, [row(fault) for fault in faults]),
         )
     )

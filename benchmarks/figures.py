@@ -62,6 +62,12 @@ METRICS = {
     "growth": Metric(
         "growth MB", lambda t: (t.memory[-1] - t.memory[0]) / 1e6 if t.memory else None
     ),
+    "blocks": Metric("blocks held by an outstanding call", lambda t: t.added.get("blocks")),
+    "bytes": Metric("bytes held by it", lambda t: t.added.get("bytes")),
+    "peak": Metric("bytes at the peak", lambda t: t.added.get("peak")),
+    "kept": Metric("blocks kept", lambda t: t.added.get("kept_blocks")),
+    "grown": Metric("growth MB", lambda t: t.added.get("growth")),
+    "pending": Metric("pending", lambda t: t.added.get("pending")),
 }
 
 
@@ -80,9 +86,9 @@ class Ratio:
 
 def brief(value: float) -> str:
     """Format a number with about three significant digits."""
-    if value >= 100:
+    if abs(value) >= 100:
         return f"{value:,.0f}"
-    return f"{value:.1f}" if value >= 10 else f"{value:.2f}"
+    return f"{value:.1f}" if abs(value) >= 10 else f"{value:.2f}"
 
 
 def figure(turns: Iterable[Turn], metric: str) -> float | None:

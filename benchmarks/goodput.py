@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from benchmarks.figures import brief
 from benchmarks.overload import Cell, Plan, measure
 from benchmarks.pages import markdown_table
-from benchmarks.trials import Goal, Trials, check
+from benchmarks.trials import GOALS, Goal, Trials, check
 
 __all__ = [
     "COMMAND",
@@ -96,7 +96,7 @@ def section(trials: Trials, picture: str) -> str:
             "is a share of what the same server does with eight callers. Goodput: the answers in "
             "time, of what the server could do. Waste: the requests that it served for callers "
             "that had left.\n",
-            markdown_table(["goal", "outcome"], [goal.row() for goal in goals(cells)]),
+            markdown_table(GOALS, [goal.row() for goal in goals(cells)]),
             markdown_table(heading, [row(cell) for cell in cells]),
         )
     )

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from benchmarks.callers import KINDS
 from benchmarks.figures import brief
 from benchmarks.pages import markdown_table
-from benchmarks.trials import Goal, Trials, check
+from benchmarks.trials import GOALS, Goal, Trials, check
 from benchmarks.work import Work
 from tests.support.child import Child
 
@@ -473,7 +473,7 @@ def section(trials: Trials, picture: str) -> str:
             "the same server does with eight callers. Goodput: the answers in time, of what the "
             "server could do. Waste: the requests that it served for callers that had left. Both "
             "count what happened while calls were offered; the number answered is that of all.\n",
-            markdown_table(["goal", "outcome"], [goal.row() for goal in goals(cells)]),
+            markdown_table(GOALS, [goal.row() for goal in goals(cells)]),
             markdown_table(heading[:-1], [row(cell)[:-1] for cell in cells]),
         )
     )

@@ -12,7 +12,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from benchmarks.allocations import allocation_rows
 from benchmarks.contestants import CONTESTANTS
 from benchmarks.figures import METRICS, figure
 from benchmarks.headline import conclusions, draw_headline, headline_rows
@@ -20,6 +19,7 @@ from benchmarks.pages import markdown_table, marked_sections
 from benchmarks.results import Results, Turn
 from benchmarks.tables import describe, rows
 from benchmarks.targets import judge
+from benchmarks.trials import GOALS
 
 __all__ = ["write_plots", "write_report"]
 
@@ -59,8 +59,6 @@ def write_report(results: Results, out: Path) -> Path:
         if scenario in plots:
             picture = plots[scenario].relative_to(out)
             sections.append(f"![{scenario}]({picture})\n")
-    for part in results.allocations[0] if results.allocations else ():
-        sections += [f"## Allocations: {part}\n", markdown_table(*allocation_rows(results, part))]
     sections += marked_sections(page.read_text()) if page.exists() else []
     sections += [METHOD, *_machine(results)]
     page.write_text("\n".join(sections))
@@ -79,7 +77,7 @@ def write_plots(results: Results, folder: Path) -> dict[str, Path]:
             for key, turns in results.contestants(scenario).items()
         }
         contestants = {key: turns for key, turns in contestants.items() if turns}
-        if not contestants:
+        if not contestants or settings["action"] == "allocate":
             continue
         drawing = _draw(scenario, settings["metric"], _shown(contestants, settings["metric"]))
         path = folder / (re.sub(r"\W+", "-", scenario) + ".svg")
@@ -185,9 +183,9 @@ def _opening(results: Results, out: Path) -> Iterator[str]:
         draw_headline(results, out / "diagrams" / "benchmark.svg")
         yield "![Latency and throughput with two servers](diagrams/benchmark.svg)\n"
         yield markdown_table(*headline_rows(results))
-    verdicts = list(judge(results))
-    if missed := [verdict.target.name for verdict in verdicts if verdict.met is False]:
-        yield f"{len(verdicts) - len(missed)} of {len(verdicts)} targets are met. Missed: " + (
+    goals = list(judge(results))
+    if missed := [goal.name for goal in goals if goal.met is False]:
+        yield f"{len(goals) - len(missed)} of {len(goals)} targets are met. Missed: " + (
             "; ".join(missed) + ".\n"
         )
 
@@ -213,13 +211,9 @@ def _machine(results: Results) -> Iterator[str]:
 
 
 def _targets(results: Results) -> Iterator[str]:
-    body = [
-        [verdict.target.name, f"{verdict.target.sense} {verdict.target.bound:.2f}", verdict.text]
-        for verdict in judge(results)
-    ]
-    if body:
+    if body := [goal.row() for goal in judge(results)]:
         yield "## Targets\n"
-        yield markdown_table(["", "target", "outcome"], body)
+        yield markdown_table(GOALS, body)
 
 
 def _title(scenario: str) -> str:

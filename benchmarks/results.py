@@ -1,9 +1,8 @@
-"""The measurements: turns with their raw samples, and the file that stores them."""
+"""The turns of suites, with their raw samples."""
 
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -11,10 +10,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from benchmarks.meter import Usage
+from benchmarks.trials import SUITES, Trials
 
 __all__ = ["Results", "Turn"]
-
-FORMAT = 1
 
 
 @dataclass(frozen=True)
@@ -26,7 +24,7 @@ class Turn:
         problem: the error of the first failed call of an otherwise good turn.
         server: the usage of the server process during the turn; None if it was not measured.
         memory: resident bytes, if the scenario measures them.
-        added: threads and descriptors, if the scenario counts them.
+        added: what else the scenario counts, such as threads, descriptors and allocated blocks.
     """
 
     scenario: str
@@ -42,41 +40,25 @@ class Turn:
     client: Usage = field(default_factory=Usage)
     server: Usage | None = None
     memory: tuple[int, ...] = ()
-    added: dict[str, int] = field(default_factory=dict)
+    added: dict[str, float] = field(default_factory=dict)
 
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> Turn:
-        server = data.pop("server")
-        return cls(
-            **{
-                **data,
-                "client": Usage(**data["client"]),
-                "server": server and Usage(**server),
-                "memory": tuple(data["memory"]),
-            }
-        )
+        for name in ("client", "server"):
+            if data.get(name):
+                data = {**data, name: Usage(**data[name])}
+        return cls(**{**data, "memory": tuple(data.get("memory", ()))})
 
     def to_json(self) -> dict[str, Any]:
         return dataclasses.asdict(self)
 
 
-@dataclass
-class Results:
-    """All measurements of one run.
+class Results(Trials):
+    """The turns of one or more suites."""
 
-    Attributes:
-        scenarios: the title, group and work of each scenario, in the order of the run.
-        skipped: for each skipped scenario, why it could not run on this machine.
-        settings: the settings of the run.
-        allocations: for each round, what each kind of ``clients`` and ``servers`` needed.
-    """
-
-    machine: dict[str, Any]
-    settings: dict[str, Any]
-    scenarios: dict[str, dict[str, Any]] = field(default_factory=dict)
-    turns: list[Turn] = field(default_factory=list)
-    skipped: dict[str, str] = field(default_factory=dict)
-    allocations: list[dict[str, dict[str, dict[str, float]]]] = field(default_factory=list)
+    def __init__(self, settings: dict[str, Any], **options: Any) -> None:
+        super().__init__(SUITES, settings, **options)
+        self.turns = [Turn.from_json(row) for row in self.rows]
 
     def of(self, scenario: str, contestant: str) -> list[Turn]:
         return [t for t in self.turns if (t.scenario, t.contestant) == (scenario, contestant)]
@@ -90,37 +72,19 @@ class Results:
         return dict(turns)
 
     def save(self, path: Path) -> None:
-        data = {
-            "format": FORMAT,
-            "machine": self.machine,
-            "settings": self.settings,
-            "scenarios": self.scenarios,
-            "turns": [turn.to_json() for turn in self.turns],
-            "skipped": self.skipped,
-            "allocations": self.allocations,
-        }
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(data, separators=(",", ":")))
+        self.rows = [turn.to_json() for turn in self.turns]
+        super().save(path)
 
     @classmethod
-    def load(cls, paths: Iterable[Path]) -> Results:
+    def read(cls, paths: Iterable[Path]) -> Results:
         """Read one or more files and merge them; the machine is that of the first file.
 
         Raises:
-            ValueError: there is no file, or a file has another format.
+            ValueError: there is no file, or a file has another format or is of another command.
         """
-        merged: Results | None = None
-        for path in paths:
-            data = json.loads(path.read_text())
-            if data.get("format") != FORMAT:
-                raise ValueError(f"{path}: not a result of these benchmarks")
-            turns = [Turn.from_json(turn) for turn in data["turns"]]
-            if merged is None:
-                merged = cls(data["machine"], data["settings"])
-            merged.scenarios |= data["scenarios"]
-            merged.turns += turns
-            merged.skipped |= data.get("skipped", {})
-            merged.allocations += data.get("allocations", [])
-        if merged is None:
-            raise ValueError("no results to read")
-        return merged
+        found = Trials.load(paths)
+        if [trials.command for trials in found] != [SUITES]:
+            raise ValueError("these are not the results of suites; use `publish` for the others")
+        data = dict(found[0].__dict__)
+        del data["command"]
+        return cls(**data)

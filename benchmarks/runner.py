@@ -38,7 +38,8 @@ class Scenario:
         callers: number of concurrent callers.
         calls: number of calls in one turn, or fewer if `seconds` run out.
         action: ``call``; ``rest`` for `seconds`; ``soak``, whose length the worker decides;
-            ``tick``, with as many leaves as callers.
+            ``tick``, with as many leaves as callers. What ``allocate`` measures is in
+            `benchmarks.allocations`.
         host: the server's host: the contestants' machine, or another one, which is a network
             namespace.
         flood: number of outstanding requests of another process to the same service.
@@ -54,7 +55,7 @@ class Scenario:
     callers: int = 1
     calls: int = 4000
     seconds: float = 5.0
-    action: Literal["call", "rest", "soak", "tick"] = "call"
+    action: Literal["call", "rest", "soak", "tick", "allocate"] = "call"
     host: Literal["same", "other"] = "same"
     flood: int = 0
     rounds: int = 1000

@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from benchmarks.contestants import CONTESTANTS
 from benchmarks.figures import brief
 from benchmarks.pages import markdown_table
-from benchmarks.trials import Goal, Trials, check
+from benchmarks.trials import GOALS, Goal, Trials, check
 from benchmarks.work import Work
 from tests.support.child import ROOT, Child
 from tests.support.flood import CALLERS as FLOODERS
@@ -337,7 +337,7 @@ def section(trials: Trials, picture: str) -> str:
             "## Several processes on one server\n",
             f"`python -m benchmarks sharing`. {_sentence(trials, cells)}\n",
             f"{trials.conditions}\n",
-            markdown_table(["goal", "outcome"], [goal.row() for goal in goals(cells)]),
+            markdown_table(GOALS, [goal.row() for goal in goals(cells)]),
             markdown_table(heading, [row(cell) for cell in cells]),
             f"![several processes on one server]({picture})\n",
         )

@@ -16,7 +16,7 @@ from std_srvs.srv import SetBool
 
 import rosasync
 from benchmarks.pages import markdown_table
-from benchmarks.trials import Goal, Trials, check
+from benchmarks.trials import GOALS, Goal, Trials, check
 from tests.support.child import Child, serve_commands
 
 __all__ = ["COMMAND", "TARGET", "Times", "goals", "heading", "measure", "rows", "section"]
@@ -81,7 +81,7 @@ def section(trials: Trials) -> str:
             f"`python -m benchmarks status`. {trials.conditions} One call at a time to a server in "
             "another process, by turns one whose handler raises and one that is answered. The "
             "times are from the end of the handler to the caller's resumption.\n",
-            markdown_table(["goal", "outcome"], [goal.row() for goal in goals(found)]),
+            markdown_table(GOALS, [goal.row() for goal in goals(found)]),
             markdown_table(heading, list(rows(found))),
         )
     )

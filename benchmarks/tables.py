@@ -12,11 +12,11 @@ from rich.table import Table
 
 from benchmarks.figures import METRICS, brief, figure, pooled_percentile, ratio
 from benchmarks.results import Results, Turn
-from benchmarks.targets import judge
 from benchmarks.ticks import describe_ticks
+from benchmarks.trials import GOALS, Goal
 from benchmarks.work import SERVERS
 
-__all__ = ["describe", "make_console", "make_table", "rows", "scenario_table", "target_table"]
+__all__ = ["describe", "goal_table", "make_console", "make_table", "rows", "scenario_table"]
 
 WIDTH = 180
 
@@ -27,6 +27,7 @@ COLUMNS = {
     "threads": ("threads", "descriptors"),
     "share": ("share",),
     "growth": ("growth",),
+    "peak": ("blocks", "bytes", "peak", "kept", "grown", "pending"),
 }
 POOLED = {"p99": 99.0, "p99.9": 99.9}
 BASELINES = {"call": "÷ call", "floor": "÷ floor"}
@@ -41,6 +42,8 @@ def describe(scenario: dict[str, Any]) -> str:
         return f"{work['idle_clients'] or 'one'} client(s), no calls, {scenario['seconds']:g} s"
     if scenario["action"] == "soak":
         return "of the calls, a third is answered, a third times out, and a third is cancelled"
+    if scenario["action"] == "allocate":
+        return "memory of a call or a request, and what stays allocated after many"
     place = ", on another host" if scenario["host"] == "other" else ""
     server = {
         "inside": "in the same process",
@@ -66,14 +69,15 @@ def rows(results: Results, scenario: str) -> tuple[list[str], list[list[str]]]:
     metric = results.scenarios[scenario]["metric"]
     contestants = results.contestants(scenario)
     baselines = {key: label for key, label in BASELINES.items() if key in contestants}
-    heading = [METRICS[name].label for name in COLUMNS[metric]]
+    columns = [c for c in COLUMNS[metric] if any(_cell(t, c) for t in contestants.values())]
+    heading = [METRICS[name].label for name in columns]
     table = []
     for key, turns in contestants.items():
         ratios = [ratio(turns, contestants[base], metric) for base in baselines]
         table.append(
             [
                 key,
-                *(_cell(turns, column) for column in COLUMNS[metric]),
+                *(_cell(turns, column) for column in columns),
                 *(str(found) if found else "" for found in ratios),
                 _remarks(turns),
             ]
@@ -104,19 +108,10 @@ def make_table(title: str, heading: list[str], body: list[list[str]]) -> Table:
     return table
 
 
-def target_table(results: Results) -> Table | None:
-    """Return the table of the targets, or None if none was measured."""
-    verdicts = list(judge(results))
-    if not verdicts:
-        return None
-    table = Table(title="[bold]targets[/]", title_justify="left", box=SIMPLE)
-    for column in ("", "bound", "outcome"):
-        table.add_column(column)
-    style = {True: "green", False: "red", None: "yellow"}
-    for verdict in verdicts:
-        bound = f"{verdict.target.sense} {verdict.target.bound:.2f}"
-        table.add_row(verdict.target.name, bound, verdict.text, style=style[verdict.met])
-    return table
+def goal_table(goals: Iterable[Goal]) -> Table | None:
+    """Return the table of goals, or None if none was measured."""
+    rows = [goal.row() for goal in goals if goal.met is not None or goal.note]
+    return make_table("goals", GOALS, rows) if rows else None
 
 
 def _cell(turns: Iterable[Turn], metric: str) -> str:

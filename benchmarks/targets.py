@@ -9,8 +9,9 @@ from typing import Literal
 from benchmarks.contestants import CONTESTANTS
 from benchmarks.figures import brief, figure, ratio
 from benchmarks.results import Results
+from benchmarks.trials import Goal, check
 
-__all__ = ["PEERS", "TARGETS", "Side", "Target", "Verdict", "judge"]
+__all__ = ["PEERS", "TARGETS", "Side", "Target", "judge"]
 
 Side = tuple[str, str]
 """A scenario and a contestant, or one of `PEERS`."""
@@ -49,15 +50,6 @@ class Target:
     def sides(self) -> list[Side]:
         """Every side that has to be measured."""
         return [side for side in (self.of, self.to, self.beside) if side]
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """The outcome of a target; `met` is None if it was not measured."""
-
-    target: Target
-    met: bool | None
-    text: str
 
 
 ONE, EIGHT, INSIDE = "one at a time", "8 callers", "server inside"
@@ -212,36 +204,35 @@ TARGETS = (
 )
 
 
-def judge(results: Results) -> Iterator[Verdict]:
-    """Return a verdict for each target whose scenarios are all in the results."""
+def judge(results: Results) -> Iterator[Goal]:
+    """Compare each target whose scenarios are all in the results."""
     for target in TARGETS:
         if all(results.contestants(scenario) for scenario, _ in target.sides):
-            yield _judge(target, results)
+            value, note = _measured(target, results)
+            yield check(target.name, value, target.sense, target.bound, note)
 
 
-def _judge(target: Target, results: Results) -> Verdict:
+def _measured(target: Target, results: Results) -> tuple[float | None, str]:
+    """Return the figure of a target with its spread, or why there is none."""
     better = min if target.metric in LATENCIES else max
     sides = {side: _best(results, side, target.metric, better) for side in target.sides}
     for side in sides.values():
         if figure(results.of(*side), target.metric) is None:
-            return Verdict(target, None, f"not measured: {_reason(results, side)}")
+            return None, _reason(results, side)
     of = sides[target.of]
+    value, note = figure(results.of(*of), target.metric), ""
     if target.to:
         to = sides[target.to]
         found = ratio(results.of(*of), results.of(*to), target.metric)
         if found is None:
-            return Verdict(target, None, "not measured: no round that both completed")
-        value, spread = found.median, f", {found.low:.2f} to {found.high:.2f} in {found.rounds}"
-        spread += f"; {to[1]}" if to != target.to else ""
-    else:
-        value, spread = figure(results.of(*of), target.metric) or 0.0, ""
+            return None, "no round that both completed"
+        value, note = found.median, f"{found.low:.2f} to {found.high:.2f} in {found.rounds}"
+        note += f"; {to[1]}" if to != target.to else ""
     if target.beside:
         beside = sides[target.beside]
-        spread += f"; {beside[1]}: {brief(figure(results.of(*beside), target.metric) or 0.0)}"
-    if value <= target.bound if target.sense == "<=" else value >= target.bound:
-        return Verdict(target, True, f"met: {value:.2f}{spread}")
-    other = ">" if target.sense == "<=" else "<"
-    return Verdict(target, False, f"missed: {value:.2f} {other} {target.bound:.2f}{spread}")
+        shown = brief(figure(results.of(*beside), target.metric) or 0.0)
+        note = "; ".join(filter(None, (note, f"{beside[1]}: {shown}")))
+    return value, note
 
 
 def _best(results: Results, side: Side, metric: str, better: Callable[..., str]) -> Side:
