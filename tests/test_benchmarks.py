@@ -24,6 +24,7 @@ from benchmarks import (
     profile,
     sharing,
     status,
+    topics,
 )
 from benchmarks.contestants import CONTESTANTS, make_contestant
 from benchmarks.contestants.base import LoggedCall
@@ -531,6 +532,11 @@ def test_a_small_run_of_goodput() -> None:
     cells = goodput.measure(goodput.plans([0.5]), 1.0)
     assert [(cell.client, cell.server) for cell in cells] == list(goodput.PAIRS)
     assert all(cell.sent for cell in cells)
+
+
+@pytest.mark.slow
+def test_the_topics_of_status_are_matched() -> None:
+    assert [found["endpoints"] for found in topics.measure(3)] == [6, 6]
 
 
 @pytest.mark.slow
