@@ -14,16 +14,20 @@ import sys
 import tracemalloc
 from array import array
 from collections import Counter
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
 from dataclasses import astuple, dataclass, replace
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
+import pytest
+from test_msgs.action import Fibonacci
+
 import rosasync
-from rosasync import Session
+from rosasync import ServerGoal, Session
 from tests.support.echo import ECHO, request_of
 from tests.support.serving import echo_call
-from tests.support.times import LIMIT
+from tests.support.times import LIMIT, until
 
 if TYPE_CHECKING:
     from tests.support.fake_graph import FakeGraph
@@ -211,3 +215,48 @@ async def test_what_is_more_is_noticed(fake_graph: FakeGraph) -> None:
         assert (await cost_of(twice)).functions == 2 * FAKE.functions
         assert (await cost_of(kept_call)).left > FAKE.left
         assert (await cost_of(cyclic_call)).cycles > FAKE.cycles
+
+
+@asynccontextmanager
+async def goals_that_run(session: Session, server: Session, count: int) -> AsyncIterator[None]:
+    """Goals of one session that run on the server of another, with their results asked for."""
+
+    async def handler(goal: ServerGoal[Any, Any]) -> None:
+        await asyncio.Event().wait()
+
+    action = server.serve_action(Fibonacci, "/held", handler, concurrency=count)
+    tasks = [asyncio.create_task(session.act(Fibonacci, "/held")) for _ in range(count)]
+    try:
+        # On a loaded machine, some are asked for twice.
+        await until(lambda: action.statistics().running == count <= action.statistics().asking)
+        yield
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def check_beside_goals(call: Call, bound: Cost) -> None:
+    """Check that a call beside goals that run enters no function for each of them."""
+    functions, c_functions = await _count_functions(call, CALLS)
+    # Sometimes a message for a goal arrives together with the response.
+    assert functions <= bound.functions + 2
+    assert c_functions <= bound.c_functions + 2
+
+
+async def test_a_call_beside_goals_that_run(fake_graph: FakeGraph) -> None:
+    fake_graph.serve(Echo, "/echo", lambda request: Echo.Response())
+    request = Echo.Request()
+    async with fake_graph.session() as server, fake_graph.session() as session:
+        client = session.client(Echo, "/echo")
+        async with goals_that_run(session, server, 100):
+            await check_beside_goals(lambda: client.call(request), FAKE)
+
+
+@pytest.mark.slow
+async def test_a_call_beside_a_thousand_goals(session: Session, echo: str) -> None:
+    request = request_of("x")
+    client = session.client(ECHO, echo)
+    await client.wait(LIMIT)
+    async with Session("server") as server, goals_that_run(session, server, 1_000):
+        await check_beside_goals(lambda: client.call(request), BOUNDS[session.bridge])
