@@ -198,6 +198,11 @@ class Clients:
         for client in self:
             client.lose_servers(servers, AllServersGone)
 
+    def set_timers(self) -> None:
+        """Let the clients give up the places of lost requests, because a caller waits."""
+        for client in self:
+            client.set_timer()
+
     def resize(self) -> None:
         """Set the window of every client to its share of the server's queue."""
         self.matching.count_servers()

@@ -185,7 +185,7 @@ class Dispatch:
         if free:
             self.schedule()
         else:
-            self._set_timers()
+            self.clients.set_timers()
 
     def start_leased(self, call: Call, now: float) -> None:
         """Start a call on a lease now, or when its client is matched and has its place.
@@ -202,7 +202,7 @@ class Dispatch:
             matched = call.lease.matched_generation == self._watch.generation
             self._traces.wait(call.trace, not matched)
         self._watch.poll_soon()
-        self._set_timers()
+        self.clients.set_timers()
 
     def send_again(self, call: Call) -> None:
         """Send a call again as soon as there are a server and a place."""
@@ -343,12 +343,7 @@ class Dispatch:
             if self.awaits_match:
                 self._watch.poll_soon()
             if self.callers_wait():
-                self._set_timers()
-
-    def _set_timers(self) -> None:
-        """Let the clients give up the places of lost requests, because a caller waits."""
-        for client in self.clients:
-            client.set_timer()
+                self.clients.set_timers()
 
     def _may_send_again(self, call: Call) -> bool:
         client = call.client
