@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 import rosasync
-from rosasync._ros import fresh_ports
+from rosasync._ros import configuration, fresh_ports
 from rosasync._ros.fresh_ports import LEASE, dead_ports, fresh_offset, port_prefix
 from tests.support.process import ROOT, ended, first_line
 from tests.support.servers import ServerProcess
@@ -274,3 +274,10 @@ def test_many_processes_at_once() -> None:
         for process in processes:
             process.communicate("end\n", timeout=LIMIT)
             assert process.returncode == 0
+
+
+async def test_when_none_is_left_a_session_opens(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(configuration, "fresh_offset", lambda *_: None)
+    async with rosasync.Session("itself", timeout=LIMIT) as session:
+        session.serve(EMPTY, "/itself", lambda request, response: response)
+        await session.call(EMPTY, "/itself")
