@@ -16,6 +16,7 @@ from typing import Literal
 
 import pytest
 import uvloop
+from hypothesis import HealthCheck, settings
 
 from rosasync import Session
 from rosasync._ros.domain import isolate
@@ -31,6 +32,17 @@ from tests.support.times import LIMIT
 __all__ = ["pytest_terminal_summary"]
 
 isolate()
+
+# The same examples in every run, however slow the machine. `--hypothesis-profile=default` draws
+# others each time.
+settings.register_profile(
+    "repeatable",
+    derandomize=True,
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow],
+    print_blob=True,
+)
+settings.load_profile("repeatable")
 
 # A shell that starts this in the background ignores SIGINT, and child processes inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
