@@ -1,20 +1,139 @@
-"""What decides about a goal that is out: when its result is asked for, and when it is lost."""
+"""What decides about a goal that is out: its status, when to ask for its result, when to let go."""
 
 from __future__ import annotations
 
 import asyncio
+import uuid
 from collections.abc import AsyncIterator
-from uuid import UUID
 
 import pytest
 from test_msgs.action import Fibonacci
 
 from rosasync import GoalStatus, ServerGone
-from rosasync._actions.active_goal import FIRST_ASK
+from rosasync._actions.active_goal import ActiveGoal
+from rosasync._actions.active_goals import LINGER, TICK, ActiveGoals
+from rosasync._actions.cancellation import CancelAnswer, Step, next_step
+from rosasync._actions.result_plan import (
+    ENDED_ASK,
+    ENDED_PATIENCE,
+    FIRST_ASK,
+    LAST_ASK,
+    Due,
+    ResultPlan,
+)
 from rosasync.testing import VirtualClock
 from tests.support.fake_graph import FakeGraph
 from tests.support.scripted_action import ScriptedAction
 from tests.support.times import until
+
+UNKNOWN, ACCEPTED, EXECUTING, CANCELING, SUCCEEDED, CANCELED, ABORTED = GoalStatus
+
+
+@pytest.mark.parametrize(
+    ("known", "told", "then"),
+    [
+        (UNKNOWN, ACCEPTED, ACCEPTED),
+        (UNKNOWN, CANCELED, CANCELED),
+        (ACCEPTED, EXECUTING, EXECUTING),
+        (EXECUTING, CANCELING, CANCELING),
+        (CANCELING, SUCCEEDED, SUCCEEDED),
+        # A message that was overtaken by a later one.
+        (EXECUTING, ACCEPTED, EXECUTING),
+        (CANCELING, EXECUTING, CANCELING),
+        (SUCCEEDED, EXECUTING, SUCCEEDED),
+        # Another server of the name.
+        (SUCCEEDED, ABORTED, SUCCEEDED),
+        (CANCELED, ABORTED, CANCELED),
+    ],
+)
+def test_a_status_only_goes_on(known: GoalStatus, told: GoalStatus, then: GoalStatus) -> None:
+    goal = ActiveGoal(uuid.uuid4(), 0.0)
+    goal.update(known)
+    goal.update(told)
+    assert goal.status is then
+
+
+def asked_at(plan: ResultPlan, until: float) -> list[float]:
+    """Return the times at which a plan asks, if it is looked at every tenth of a second."""
+    times = []
+    for tenth in range(round(10 * until)):
+        now = tenth / 10
+        if plan.due(now) is Due.ASK:
+            plan.asked(now)
+            times.append(now)
+    return times
+
+
+def test_a_running_goal_is_asked_for_ever_more_rarely() -> None:
+    plan = ResultPlan()
+    assert plan.due(1e9) is Due.NOTHING
+    plan.asked(0.0)
+    assert asked_at(plan, 40.0) == [FIRST_ASK, 3 * FIRST_ASK, 7 * FIRST_ASK]
+    for now in (1e3, 2e3, 3e3, 4e3, 5e3):
+        plan.asked(now)
+    assert plan.due(5e3 + LAST_ASK - 1) is Due.NOTHING
+    assert plan.due(5e3 + LAST_ASK) is Due.ASK
+
+
+def test_an_ended_goal_is_asked_for_soon_and_given_up() -> None:
+    plan = ResultPlan()
+    for now in (0.0, 5.0, 15.0):
+        plan.asked(now)
+    plan.ended(20.0)
+    plan.ended(20.2)
+    times = [20.0 + ENDED_ASK * (2**number - 1) for number in range(1, 6)]
+    assert asked_at(plan, 20.0 + ENDED_PATIENCE) == times
+    assert plan.due(20.0 + ENDED_PATIENCE) is not Due.GIVE_UP
+    assert plan.due(20.1 + ENDED_PATIENCE) is Due.GIVE_UP
+
+
+@pytest.mark.parametrize(
+    ("answer", "canceling", "final", "step"),
+    [
+        (CancelAnswer.AGREED, False, False, Step.AWAIT_END),
+        (CancelAnswer.ENDED, False, False, Step.STOP),
+        # It was cancelled by another caller, or by a request whose answer was lost.
+        (CancelAnswer.ENDED, True, False, Step.AWAIT_END),
+        (CancelAnswer.REFUSED, False, False, Step.STOP),
+        # The cancellation has overtaken the goal, or another server has it.
+        (CancelAnswer.UNKNOWN, False, False, Step.RETRY),
+        (CancelAnswer.UNKNOWN, False, True, Step.STOP),
+        (None, False, True, Step.RETRY),
+        (None, True, True, Step.RETRY),
+    ],
+)
+def test_what_follows_a_cancellation(
+    answer: CancelAnswer | None, canceling: bool, final: bool, step: Step
+) -> None:
+    assert next_step(answer, canceling=canceling, final=final) is step
+
+
+async def test_the_timer_runs_while_goals_are_out_and_once_later() -> None:
+    clock = VirtualClock()
+    await clock.advance(0.0)
+    calls: list[str] = []
+    goals = ActiveGoals(lambda: calls.append("tick"), lambda: calls.append("idle"))
+    first, second = (ActiveGoal(uuid.uuid4(), 0.0) for _ in range(2))
+    goals.add(first)
+    goals.add(second)
+    assert goals.find(first.key) is first
+    await clock.advance(4.5 * TICK)
+    assert calls == ["tick"] * 4
+    assert goals.remove(first)
+    assert not goals.remove(first)
+    assert list(goals) == [second]
+    goals.remove(second)
+    await clock.advance(LINGER - TICK)
+    goals.add(first)
+    await clock.advance(1.5 * TICK)
+    assert calls == ["tick"] * 5
+    goals.remove(first)
+    await clock.advance(2 * LINGER)
+    assert calls == ["tick"] * 5 + ["idle"]
+    goals.add(first)
+    goals.stop_timer()
+    await clock.advance(LINGER)
+    assert len(calls) == 6
 
 
 @pytest.fixture
@@ -33,7 +152,7 @@ async def test_a_goal_that_is_followed_is_asked_for_as_rarely_as_ones_own(
         server.answer_send(0)
         await virtual_clock.advance(0.01)
         (key,) = server.statuses
-        async with other.attach(Fibonacci, "/fibonacci", UUID(bytes=key)) as goal:
+        async with other.attach(Fibonacci, "/fibonacci", uuid.UUID(bytes=key)) as goal:
             await virtual_clock.advance(0.9 * FIRST_ASK)
             assert len(server.asks) == 2
             await virtual_clock.advance(0.2 * FIRST_ASK)

@@ -28,7 +28,7 @@ class Requests:
         self.requests = ResultRequests(
             self.node,
             service,
-            lambda key: GET.Request(),
+            GET.Request,
             lambda key, response: self.results.append(key),
         )
         self.requests.open()

@@ -17,7 +17,7 @@ from rosasync import (
     ServerGone,
     Session,
 )
-from rosasync._actions import client as action_client
+from rosasync._actions import result_plan
 from tests.support.action_servers import ActionServerProcess
 from tests.support.times import LIMIT, TICK, until
 
@@ -181,7 +181,7 @@ async def test_forged_feedback_is_dropped(
 async def test_a_lost_request_for_the_result_is_sent_again(
     session: Session, action_server: ActionServerProcess, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(action_client, "ENDED_ASK", 2 * TICK)
+    monkeypatch.setattr(result_plan, "ENDED_ASK", 2 * TICK)
     await action_server.serve("/forgets", ignored_asks=2)
     result = await session.act(Fibonacci, "/forgets", {"order": 2})
     assert list(result.sequence) == [0, 1]
@@ -190,7 +190,7 @@ async def test_a_lost_request_for_the_result_is_sent_again(
 async def test_a_server_that_never_sends_a_result_is_not_waited_for_without_end(
     session: Session, action_server: ActionServerProcess, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(action_client, "ENDED_PATIENCE", 4 * TICK)
+    monkeypatch.setattr(result_plan, "ENDED_PATIENCE", 4 * TICK)
     await action_server.serve("/mute", ignored_asks=1_000_000)
     with pytest.raises(GoalTimeout, match="ended as SUCCEEDED, and the server does not send its"):
         await session.act(Fibonacci, "/mute")

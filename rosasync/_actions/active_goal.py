@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 from uuid import UUID
 
+from rosasync._actions.result_plan import ResultPlan
 from rosasync._actions.status import TERMINAL, GoalStatus
 
 if TYPE_CHECKING:
@@ -18,9 +18,6 @@ if TYPE_CHECKING:
     from rosasync.tracing import Outcome as TraceOutcome
 
 __all__ = ["ActiveGoal", "FeedbackQueue", "Outcome"]
-
-FIRST_ASK = 5.0
-"""Seconds after which a result is asked for again. The intervals grow."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +38,7 @@ class Outcome:
 class ActiveGoal:
     """What a session knows of a goal that is out. All handles of the goal share it.
 
-    Confined to the loop's thread. The only writer besides this class is `ActionClient`.
+    Confined to the loop's thread. `ActionClient` and its parts write the attributes.
 
     Attributes:
         id: the UUID.
@@ -60,9 +57,7 @@ class ActiveGoal:
         ended: set with the outcome, or when the session closes.
         ending: the background task that cancels it, after its caller has left.
         detached: whether it is to run on when its caller leaves.
-        ask_at: the loop time at which to ask for the result again.
-        ask_delay: seconds from then to the next time.
-        ended_at: the loop time at which the status topic has shown its end; None before.
+        plan: when to ask for its result.
         trace: follows the goal, if something listens.
     """
 
@@ -72,16 +67,14 @@ class ActiveGoal:
         "acceptance",
         "accepted_at",
         "answered",
-        "ask_at",
-        "ask_delay",
         "asked",
         "detached",
         "ended",
-        "ended_at",
         "ending",
         "id",
         "key",
         "outcome",
+        "plan",
         "servers",
         "settled",
         "started",
@@ -98,16 +91,14 @@ class ActiveGoal:
         self.accepted_at: int | None = None
         self.acceptance: asyncio.Task[None] | None = None
         self.servers: Servers = frozenset()
+        self.asked = False
         self.outcome: Outcome | None = None
         self.answered = asyncio.Event()
         self.settled = asyncio.Event()
         self.ended = asyncio.Event()
         self.ending: asyncio.Task[None] | None = None
         self.detached = False
-        self.asked = False
-        self.ask_at = math.inf
-        self.ask_delay = FIRST_ASK
-        self.ended_at: float | None = None
+        self.plan = ResultPlan()
         self._make_closed: Callable[[], Exception] | None = None
         self._readers: dict[FeedbackQueue, None] = {}
 
@@ -149,6 +140,12 @@ class ActiveGoal:
             if status is GoalStatus.CANCELING and self.trace is not None:
                 self.trace.enter("canceling")
             self.status = status
+
+    def show(self, status: GoalStatus, now: float) -> None:
+        """Set the status that the status topic shows, at this loop time."""
+        self.update(status)
+        if status in TERMINAL:
+            self.plan.ended(now)
 
     def settle(self, outcome: Outcome) -> None:
         """Set the outcome, unless there is one."""

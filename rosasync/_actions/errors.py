@@ -3,10 +3,19 @@
 from __future__ import annotations
 
 import asyncio
+from contextlib import suppress
 from typing import TYPE_CHECKING, TypeVar
 
 from rosasync._core.text import duration
-from rosasync.errors import CallError, GoalError, ServerGone, ServiceUnavailable
+from rosasync.errors import (
+    CallError,
+    ContextShutdown,
+    GoalError,
+    GoalTimeout,
+    QueueTimeout,
+    ServerGone,
+    ServiceUnavailable,
+)
 
 if TYPE_CHECKING:
     from rosasync._actions.active_goal import ActiveGoal
@@ -14,6 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["GoalErrors"]
 
+ErrorT = TypeVar("ErrorT", bound=BaseException)
 GoalErrorT = TypeVar("GoalErrorT", bound=GoalError)
 
 
@@ -47,6 +57,27 @@ class GoalErrors:
     def server_gone(self, goal: ActiveGoal, what: str) -> CallError:
         """Return the error for a goal whose server has vanished."""
         return self._call(ServerGone, f"{what} (goal {goal.id})", self._elapsed(goal))
+
+    def translate(self, goal: ActiveGoal, error: ErrorT, what: str) -> ErrorT | CallError:
+        """Return the error of the action for an error of one of its services.
+
+        Args:
+            goal: the goal that the service was called for.
+            error: the error; what is not of a service is returned as it is.
+            what: what did not happen.
+        """
+        if not isinstance(error, CallError) or error.srv_name == self._action.name:
+            return error
+        if isinstance(error, ServiceUnavailable):
+            with suppress(ContextShutdown):
+                return self.unavailable(goal)
+        if isinstance(error, ServerGone):
+            return self.server_gone(goal, f"{what}: every server vanished")
+        if isinstance(error, TimeoutError):
+            reason = "no place in the window" if isinstance(error, QueueTimeout) else "no answer"
+            what = f"{what} within {error.elapsed:.3g} s: {reason}"
+            return self.goal(GoalTimeout, goal, what)
+        return error
 
     def _call(self, kind: type[CallError], what: str, elapsed: float) -> CallError:
         name, type_name = self._action.name, self._action.type_name

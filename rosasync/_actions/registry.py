@@ -76,7 +76,7 @@ class Actions:
     @property
     def out(self) -> int:
         """How many goals are out."""
-        return sum(len(client.goals) for client in self._clients.values())
+        return sum(client.out for client in self._clients.values())
 
     def check_open(self) -> None:
         """Raise the error that callers get, once the session has begun to close."""
@@ -249,10 +249,7 @@ class Actions:
             self._closing = make_error
         tasks: set[asyncio.Task[None]] = set()
         for client in tuple(self._clients.values()):
-            client.close_callers(make_error)
-            ending = [client.abandon(goal) for goal in client.goals]
-            if client.is_provided():
-                tasks.update(task for task in ending if task is not None)
+            tasks |= client.close(make_error)
         if tasks:
             await asyncio.wait(tasks, timeout=CLOSE_TIMEOUT)
 

@@ -38,7 +38,7 @@ class ResultRequests:
     Args:
         node: creates the client.
         service: the action's service for results.
-        make_request: makes the request for the bytes of a goal's UUID.
+        request_type: the class of its requests.
         on_result: called with the bytes of the UUID and the response.
     """
 
@@ -46,13 +46,13 @@ class ResultRequests:
         self,
         node: NodePort,
         service: Service,
-        make_request: Callable[[bytes], Any],
+        request_type: type[Any],
         on_result: Callable[[bytes, Any], None],
     ) -> None:
         self._loop = asyncio.get_running_loop()
         self._node = node
         self._service = service
-        self._make_request = make_request
+        self._request_type = request_type
         self._on_result = on_result
         self._port: ClientPort | None = None
         self._queue: OrderedDict[bytes, None] = OrderedDict()
@@ -134,8 +134,10 @@ class ResultRequests:
 
     def _send_one(self, key: bytes) -> bool:
         assert self._port is not None
+        request = self._request_type()
+        request.goal_id.uuid = list(key)
         try:
-            number = self._port.send(self._make_request(key))
+            number = self._port.send(request)
         except PortDestroyed:
             self._replace()
             self._queue[key] = None
