@@ -63,6 +63,31 @@ def test_imports_make_no_circle() -> None:
         pytest.fail(f"imports make a circle: {' -> '.join(error.args[1])}")
 
 
+def test_no_module_is_longer_than_600_lines() -> None:
+    lengths = {name: len(file.read_text().splitlines()) for name, file in FILES.items()}
+    assert {name: lines for name, lines in lengths.items() if lines > 600} == {}
+
+
+def test_no_class_has_more_than_28_methods() -> None:
+    counts = {
+        f"{name}.{node.name}": sum(map(_is_method, node.body))
+        for name, file in FILES.items()
+        for node in ast.walk(ast.parse(file.read_text()))
+        if isinstance(node, ast.ClassDef)
+    }
+    assert {name: methods for name, methods in counts.items() if methods > 28} == {}
+
+
+def _is_method(statement: ast.stmt) -> bool:
+    """Whether this defines a method: an overload and a setter are further forms of one."""
+    if not isinstance(statement, ast.FunctionDef | ast.AsyncFunctionDef):
+        return False
+    decorators = [ast.unparse(decorator) for decorator in statement.decorator_list]
+    return "overload" not in decorators and not any(
+        decorator.endswith(".setter") for decorator in decorators
+    )
+
+
 def test_the_design_page_lists_every_file() -> None:
     listed = _listed_files()
     there = {

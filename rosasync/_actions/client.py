@@ -48,6 +48,12 @@ class ActionClient:
     feedback, one for statuses and one client for results. They stay for a while after the last
     goal, so that the next one need not be matched again. The session's pool sends and cancels
     goals.
+
+    Attributes:
+        action: the action.
+        errors: makes the errors of its goals.
+        goals: those that are out.
+        cancel: asks the server to cancel a goal; see `Cancellations.cancel`.
     """
 
     def __init__(
@@ -61,9 +67,8 @@ class ActionClient:
         self._tracing = tracing
         self._owner = owner
         self._types = action.action_type.Impl
-        self._goals = ActiveGoals(self._tick, self._close_ports)
-        self.find = self._goals.find
-        self._topics = ActionTopics(action, node, self._goals.find)
+        self.goals = ActiveGoals(self._tick, self._close_ports)
+        self._topics = ActionTopics(action, node, self.goals.find)
         self._results = ResultRequests(
             node, action.get_result, self._types.GetResultService.Request, self._on_result
         )
@@ -76,12 +81,7 @@ class ActionClient:
         self._gone_timer: asyncio.TimerHandle | None = None
 
     def __repr__(self) -> str:
-        return f"<ActionClient {self.action.name} {count(len(self._goals), 'goal')}>"
-
-    @property
-    def out(self) -> int:
-        """How many goals are out."""
-        return len(self._goals)
+        return f"<ActionClient {self.action.name} {count(len(self.goals), 'goal')}>"
 
     def make_queue(self, size: int) -> FeedbackQueue:
         """Return a queue for the feedback that one handle reads."""
@@ -178,7 +178,7 @@ class ActionClient:
             ContextShutdown: the node is down.
         """
         self._watch.reset()
-        self._expect_loss(self._goals)
+        self._expect_loss(self.goals)
 
     def close(self, make_error: Callable[[], Exception]) -> set[asyncio.Task[None]]:
         """Let every caller go with an error, because the session closes, and cancel the goals.
@@ -186,14 +186,14 @@ class ActionClient:
         Returns:
             The tasks that do it; none if there is no server.
         """
-        for goal in self._goals:
+        for goal in self.goals:
             goal.close(make_error)
-        tasks = [self._cancellations.abandon(goal) for goal in self._goals]
+        tasks = [self._cancellations.abandon(goal) for goal in self.goals]
         return {task for task in tasks if task is not None} if self._watch.exists() else set()
 
     def end(self, make_error: Callable[[], Exception]) -> None:
         """End every goal with an error, and destroy the ports; idempotent."""
-        for goal in self._goals:
+        for goal in self.goals:
             self._settle(goal, Outcome(goal.status, make_error=make_error))
             if goal.acceptance is not None:
                 goal.acceptance.cancel()
@@ -206,11 +206,11 @@ class ActionClient:
         self._owner.check_open()
         self._results.open()
         self._topics.open()
-        self._goals.add(goal)
+        self.goals.add(goal)
 
     def _remove(self, goal: ActiveGoal) -> None:
         """Drop a goal, if it is out."""
-        if self._goals.remove(goal):
+        if self.goals.remove(goal):
             self._results.forget(goal.key)
 
     def _settle(self, goal: ActiveGoal, outcome: Outcome) -> None:
@@ -239,7 +239,7 @@ class ActionClient:
             self._owner.on_shutdown()
             return
         now = self._loop.time()
-        for goal in self._goals:
+        for goal in self.goals:
             self._check(goal, now)
 
     def _check(self, goal: ActiveGoal, now: float) -> None:
@@ -263,7 +263,7 @@ class ActionClient:
         goal.plan.asked(self._loop.time())
 
     def _close_ports(self) -> None:
-        self._goals.stop_timer()
+        self.goals.stop_timer()
         if self._gone_timer is not None:
             self._gone_timer.cancel()
             self._gone_timer = None
@@ -351,7 +351,7 @@ class ActionClient:
     # Their results, and what takes their place.
 
     def _on_result(self, key: bytes, response: Any) -> None:
-        goal = self._goals.find(key)
+        goal = self.goals.find(key)
         if goal is None:
             return
         if response.status == GoalStatus.UNKNOWN:
@@ -382,7 +382,7 @@ class ActionClient:
         self._gone_timer = None
         what = "every server vanished before the goal ended"
         try:
-            for goal in filter(self._watch.has_lost, self._goals):
+            for goal in filter(self._watch.has_lost, self.goals):
                 self._fail(goal, self.errors.server_gone(goal, what))
         except ContextShutdown:
             self._owner.on_shutdown()

@@ -76,7 +76,7 @@ class Actions:
     @property
     def out(self) -> int:
         """How many goals are out."""
-        return sum(client.out for client in self._clients.values())
+        return sum(len(client.goals) for client in self._clients.values())
 
     def check_open(self) -> None:
         """Raise the error that callers get, once the session has begun to close."""
@@ -202,7 +202,7 @@ class Actions:
     ) -> AsyncIterator[Goal[Any, Any]]:
         client = self.client(arguments.action)
         queue = client.make_queue(feedback)
-        goal = client.find(goal_id.bytes)
+        goal = client.goals.find(goal_id.bytes)
         if goal is None:
             goal = ActiveGoal(goal_id, self._loop.time())
             goal.join(queue)
