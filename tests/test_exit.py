@@ -71,6 +71,27 @@ asyncio.run(main())
         assert "ResourceWarning: unclosed <Session" in errors
 
 
+LEFT_TO_THE_COLLECTOR = """
+import gc, threading, time
+class App:
+    async def main(self):
+        global context
+        self.session = Session("left_open", bridge=bridge)
+        await self.session.open()
+        context = self.session.node.context
+        print("called", flush=True)
+        self.session.serve("std_srvs/srv/Empty", "/own", self.handle)
+    def handle(self, request, response):
+        return response
+gc.disable()
+asyncio.run(App().main())
+end = time.monotonic() + 20
+while [t for t in threading.enumerate() if t.name.startswith("rosasync")]:
+    assert time.monotonic() < end, "its thread goes on"
+    time.sleep(0.01)
+"""
+
+
 @pytest.mark.usefixtures("echo")
 class TestAbruptEnds:
     """The program ends before the session does."""
@@ -160,6 +181,34 @@ time.sleep(0.5)
         assert code == 0, errors
         assert "ResourceWarning: unclosed <Session" in errors
         assert "Traceback" not in errors
+
+    async def test_a_closed_loop_and_a_handler_that_refers_to_the_session(
+        self, bridge: Bridge
+    ) -> None:
+        program = """
+gc.collect()
+print("collected", file=sys.stderr, flush=True)
+"""
+        code, errors = await run_program(bridge, LEFT_TO_THE_COLLECTOR + program)
+        assert code == 0, errors
+        assert "ResourceWarning: unclosed <Session" in errors.partition("collected")[0]
+        assert "Traceback" not in errors
+
+    async def test_the_garbage_collector_is_faster_than_the_clean_up(self, bridge: Bridge) -> None:
+        """It finalizes everything before the thread that cleans up has its first turn."""
+        program = """
+warnings.simplefilter("ignore")
+interval = sys.getswitchinterval()
+sys.setswitchinterval(60)
+gc.collect()
+sys.setswitchinterval(interval)
+while context.ok():
+    assert time.monotonic() < end, "its node is not destroyed"
+    time.sleep(0.01)
+"""
+        code, errors = await run_program(bridge, LEFT_TO_THE_COLLECTOR + program)
+        assert code == 0, errors
+        assert "Exception ignored" not in errors
 
     async def test_the_context_goes_down_first(self, bridge: Bridge) -> None:
         program = """

@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 import itertools
 import math
+import os
 import threading
+import weakref
 from collections.abc import Callable, Coroutine, Generator
 from concurrent.futures import Future
 from contextlib import suppress
@@ -17,7 +19,7 @@ from anyio.lowlevel import checkpoint_if_cancelled
 
 from rosasync.errors import RosasyncError
 
-__all__ = ["Deadlines", "Expired", "call_in_thread", "start_task", "until_done"]
+__all__ = ["Deadlines", "Expired", "LoopEnd", "call_in_thread", "start_task", "until_done"]
 
 T = TypeVar("T")
 
@@ -103,6 +105,43 @@ class Deadlines:
                 future.set_exception(Expired())
         if heap:
             self._arm(heap[0][0])
+
+
+class LoopEnd:
+    """Calls a function when the running loop is closed, on the thread that closes it.
+
+    asyncio has no hook for that. But a loop that is closed drops its readers, so an object to which
+    only a reader refers ends with it. A loop without readers never calls the function.
+
+    Args:
+        on_end: the function. It must not raise, and must not take a lock.
+    """
+
+    def __init__(self, on_end: Callable[[], object]) -> None:
+        self._loop = asyncio.get_running_loop()
+        # Nothing is written into the pipe.
+        self._pipe = os.pipe()
+        reader = _Reader()
+        self._reader: weakref.ref[_Reader] | None = weakref.ref(reader, lambda _: on_end())
+        with suppress(NotImplementedError):
+            self._loop.add_reader(self._pipe[0], reader)
+
+    def close(self) -> None:
+        """Forget the function; idempotent. From any thread once the loop is closed."""
+        if self._reader is None:
+            return
+        self._reader = None
+        with suppress(NotImplementedError, RuntimeError):
+            self._loop.remove_reader(self._pipe[0])
+        for descriptor in self._pipe:
+            os.close(descriptor)
+
+
+class _Reader:
+    """A callback that is never called."""
+
+    def __call__(self) -> None:
+        raise AssertionError("the pipe is empty")
 
 
 def start_task(

@@ -5,7 +5,9 @@ from __future__ import annotations
 import _thread
 import asyncio
 import atexit
+import functools
 import logging
+import os
 import sys
 import threading
 import warnings
@@ -20,6 +22,7 @@ from rosasync._actions.server import ActionServer
 from rosasync._client.pool import ClientPool
 from rosasync._core.aio import until_done
 from rosasync._core.arguments import ArgumentChecker
+from rosasync._core.fork import check_fork
 from rosasync._core.gateway import LoopGateway
 from rosasync._core.portal import Portal
 from rosasync._server.server import ServiceServer
@@ -81,7 +84,15 @@ class Core:
         self._session = weakref.ref(session)
         self._end_task: asyncio.Task[None] | None = None
         self._cleaned_up = threading.Event()
-        atexit.register(self._exit)
+        self._process = os.getpid()
+        # Weak, because what the session serves may refer to the session.
+        self._at_exit = functools.partial(_exit, weakref.ref(self))
+        atexit.register(self._at_exit)
+
+    @property
+    def inherited(self) -> bool:
+        """Whether this process was forked from the session's, which alone can end it."""
+        return os.getpid() != self._process
 
     def check_loop(self) -> None:
         """Raise `UsageError` on any other loop or thread than the session's."""
@@ -90,6 +101,7 @@ class Core:
 
     def _explain_loop(self) -> str:
         """Return what is wrong with the caller's loop or thread, and what to do."""
+        check_fork()
         name = f"session {self.name!r}"
         if not self.gateway.on_thread:
             return f"{name} belongs to the loop of another thread: use session.from_thread here"
@@ -155,6 +167,8 @@ class Core:
     async def aclose(self) -> None:
         """End everything; idempotent. All callers wait for the same task."""
         self.closed = True
+        if self.inherited:
+            return
         # Before the task is created, because an eager one closes the servers at once.
         for action_server in self.action_servers:
             action_server.exclude_caller()
@@ -170,6 +184,8 @@ class Core:
         The garbage collector may run this while the thread holds any lock. So it takes none, which
         also rules out a ``threading.Thread``.
         """
+        if self.inherited:
+            return
         warning = f"unclosed {session!r}"
         self.closed = True
         self.node.stop()
@@ -191,11 +207,13 @@ class Core:
         self._end_servers(session_closed)
         if self.node.join():
             self.node.close()
-        atexit.unregister(self._exit)
+        atexit.unregister(self._at_exit)
         self._cleaned_up.set()
 
-    def _exit(self) -> None:
+    def exit(self) -> None:
         """End the executor thread, because the interpreter aborts if it exits while one spins."""
+        if self.inherited:
+            return
         session = self._session()
         warning = None
         if session is not None and not self.closed:
@@ -241,7 +259,7 @@ class Core:
                     END_TIMEOUT,
                 )
             # Last: if a second Ctrl-C interrupts the end, the interpreter's exit completes it.
-            atexit.unregister(self._exit)
+            atexit.unregister(self._at_exit)
 
     def _graph_changed(self) -> None:
         self.pool.graph_changed()
@@ -265,6 +283,12 @@ class Core:
             action_server.end(ending)
         for server in tuple(self.servers):
             server.end(ending)
+
+
+def _exit(reference: weakref.ref[Core]) -> None:
+    core = reference()
+    if core is not None:
+        core.exit()
 
 
 def session_closed() -> SessionClosed:

@@ -104,7 +104,8 @@ class Opening:
         if self.core is None:
             self._closed = True
             return
-        self.core.check_loop()
+        if not self.core.inherited:
+            self.core.check_loop()
         await self.core.aclose()
 
     def parts(self) -> Core:

@@ -128,7 +128,10 @@ class ExecutorThread:
         if self._ended:
             if self._node.executor is self._executor:
                 self._node.executor = None
-            self._executor.shutdown()
+            # The garbage collector destroys the guard condition for SIGINT before, if it collects
+            # the executor together with an unclosed session.
+            with contextlib.suppress(InvalidHandle, ValueError):
+                self._executor.shutdown()
 
     def _run(self) -> None:
         try:
@@ -202,6 +205,9 @@ class _OwnExecutor(SingleThreadedExecutor):  # type: ignore[misc]
         """Stop executing callbacks."""
         self.is_shut_down = True
         return bool(super().shutdown(timeout_sec))
+
+    def __del__(self) -> None:
+        """Do not destroy the guard condition here: another thread may be in `shutdown`."""
 
 
 def executor_thread_of(node: Node, user: ThreadUser) -> ExecutorThread | None:

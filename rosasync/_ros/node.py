@@ -10,6 +10,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 
+from rosasync._core.aio import LoopEnd
 from rosasync._core.fork import check_fork, note_use
 from rosasync._core.gateway import LoopGateway
 from rosasync._core.ports import (
@@ -86,6 +87,7 @@ class RosNode:
             self._events.post_error, self._events.post_shutdown, self._events.post_left
         )
         self._thread: ExecutorThread | None = None
+        self._loop_end: LoopEnd | None = None
         self._waitable: GraphWaitable | None = None
         self._bridge: Bridge | None = None
         self._publishers: dict[Publisher, None] = {}
@@ -242,6 +244,8 @@ class RosNode:
 
     def close(self) -> None:
         """Return what was borrowed and destroy what is owned; call `stop` and `join` first."""
+        if self._loop_end is not None:
+            self._loop_end.close()
         if self._waitable is not None:
             self._waitable.close()
         if self._bridge is not None:
@@ -257,7 +261,7 @@ class RosNode:
 
     def _open(self, options: SessionOptions, gateway: LoopGateway) -> None:
         node = self._node
-        note_use()
+        note_use(self)
         check_up(node)
         self._name = str(node.get_name())
         self._identities = Identities(node)
@@ -271,6 +275,9 @@ class RosNode:
         if options.executor is not None:
             self._held.add_to(options.executor)
         self._thread = executor_thread_of(node, self._user)
+        # A session whose loop is closed is of no use, and its thread would keep it from being
+        # collected: the node's callbacks may refer to it.
+        self._loop_end = LoopEnd(self.stop)
 
     def _make_queries(self, events: bool) -> GraphQueries:
         """Make `queries`. The node of `rosasync.testing` overrides this."""
