@@ -294,7 +294,7 @@ class Dispatch:
             if client is None or waiter is None:
                 break
             waiter.start(client, now)
-        self._replace_clients()
+        self._grow_clients()
 
     def _next_waiter(self, client: Client, now: float) -> Waiter | None:
         """Take the first caller who can be answered in time, and pass over those before.
@@ -380,7 +380,7 @@ class Dispatch:
             ):
                 waiter.set_result(None)
 
-    def _replace_clients(self) -> None:
+    def _grow_clients(self) -> None:
         """Create clients for the waiting callers, if something else has destroyed some.
 
         If that fails, all waiting callers get the error.
