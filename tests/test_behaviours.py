@@ -677,6 +677,7 @@ class TestTrees:
         assert answers == ["/slow"]
         await until(lambda: session.pool.statistics().cancelled == 1)
 
+    @pytest.mark.slow
     async def test_a_parallel_of_all(
         self, session: Session, robot: ServerProcess, where: Literal["loop", "thread"]
     ) -> None:

@@ -152,6 +152,7 @@ def test_a_report_is_of_suites_only(tmp_path: Path) -> None:
         Results.read([file])
 
 
+@pytest.mark.slow
 def test_the_report_shows_also_what_hung_was_lost_or_skipped(tmp_path: Path) -> None:
     flood, idle, other = (suites()[key] for key in ("flood", "idle, 50 clients", "another host"))
     results = results_of(flood, {"direct-retry": list(range(1, 100)), "spin-until": []}, lost=5)
@@ -344,6 +345,7 @@ def test_a_report_keeps_the_marked_sections(tmp_path: Path) -> None:
     assert "former" not in page.read_text()
 
 
+@pytest.mark.slow
 def test_a_report_opens_with_its_conclusions(tmp_path: Path) -> None:
     one = suites()["one at a time"]
     page = write_report(results_of(one, {"direct": [50], "call": [200]}), tmp_path).read_text()

@@ -51,6 +51,7 @@ def test_without_arguments_it_prints_the_help() -> None:
     assert rosasync().stdout == rosasync("--help").stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "advice"),
     [
@@ -132,11 +133,13 @@ def test_completes_commands_and_types() -> None:
     assert complete("rosasync show nothing_like_it") == []
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("lamp")
 def test_completes_names_of_services() -> None:
     assert LAMP in complete("rosasync call /lamp/sw")
 
 
+@pytest.mark.slow
 def test_a_watch_ends_after_a_count() -> None:
     with IntrospectedProcess() as watched:
         process = subprocess.Popen(

@@ -117,6 +117,7 @@ async def test_fragment(code: str, graph: Graph) -> None:
 class TestNodes:
     """The pages about nodes. Each fragment runs beside the nodes that it names."""
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("code", fragments(DOCS / "how-to" / "parameters.md"))
     async def test_parameters(
         self, code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -125,6 +126,7 @@ class TestNodes:
         (tmp_path / "all.yaml").write_text("/**:\n  ros__parameters:\n    speed: 0.5\n")
         await self._run(code, "arm")
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("code", fragments(DOCS / "how-to" / "lifecycle.md"))
     async def test_lifecycle(self, code: str) -> None:
         await self._run(code, "camera")

@@ -54,6 +54,7 @@ def test_a_call_error_is_copied_and_pickled(kind: type[CallError]) -> None:
         assert details(twin) == details(error)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_call_error_comes_out_of_a_process_pool(kind: type[CallError]) -> None:
     with multiprocessing.get_context("spawn").Pool(1) as pool, pytest.raises(kind) as caught:

@@ -127,6 +127,7 @@ asyncio.run(main())
         assert "KeyboardInterrupt" in errors
         assert "ResourceWarning" not in errors
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         ("loop", "handles"),
         [("asyncio", True), ("uvloop", False)],

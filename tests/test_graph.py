@@ -148,6 +148,7 @@ class TestAnotherType:
         assert [type(error) for error in proxy.get_errors()] == [ServiceUnavailable]
         await assert_clean(mismatched)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("wait", WAITS)
     async def test_a_warning_once(
         self, mismatched: Session, caplog: pytest.LogCaptureFixture, wait: Wait

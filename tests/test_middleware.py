@@ -57,6 +57,7 @@ def test_the_command_line_says_so_in_one_line() -> None:
     assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_show_prints_fields_defaults_constants_and_nested_messages() -> None:
     done = rosasync("show", "nav_msgs/srv/GetPlan")
     assert (done.returncode, done.stderr) == (0, "")
@@ -66,6 +67,7 @@ def test_show_prints_fields_defaults_constants_and_nested_messages() -> None:
     assert "  OK = 0\n" in rosasync("show", "diagnostic_msgs/srv/SelfTest").stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "says"),
     [

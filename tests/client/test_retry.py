@@ -590,6 +590,7 @@ class TestNextServer:
             fake_graph.serve(Echo, "/echo", echo)
             assert (await asyncio.wait_for(task, LIMIT)).value == 1
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("leased", [False, True])
     async def test_a_restarted_stock_server(
         self, bridge: Bridge, server: ServerProcess, leased: bool

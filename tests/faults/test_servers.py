@@ -22,6 +22,7 @@ TRIGGER = "std_srvs/srv/Trigger"
 TRANSIENT = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
+@pytest.mark.slow
 async def test_killed_and_another_a_second_later(
     trial: Trial, server: ServerProcess, full: bool
 ) -> None:
@@ -40,6 +41,7 @@ async def test_killed_and_another_a_second_later(
             assert trial.failed == {"ServerGone": 10 * round_}, f"{len(received)} reached the next"
 
 
+@pytest.mark.slow
 async def test_stopped_and_continued(trial: Trial, full: bool) -> None:
     async with ServerProcess() as stopped, trial.session() as session:
         await stopped.serve("/stopped")
@@ -54,6 +56,7 @@ async def test_stopped_and_continued(trial: Trial, full: bool) -> None:
     assert trial.failed.keys() <= {"ResponseTimeout", "QueueTimeout"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("retry", [None, PATIENT], ids=["once", "Retry"])
 async def test_restarted_under_callers(
     trial: Trial, server: ServerProcess, full: bool, retry: Retry | None
