@@ -374,6 +374,15 @@ class StatusRaces(RuleBasedStateMachine):
                 assert not any(each.window.abandoned for each in pool.clients)
 
     def teardown(self) -> None:
+        try:
+            self._end()
+        finally:
+            # Also after a failure: what stays open warns in another test, when it is collected.
+            for session in self.sessions:
+                self.loop.run_until_complete(session.aclose())
+            self.loop.close()
+
+    def _end(self) -> None:
         self.graph.holding = False
         self._do(self.graph.release_requests)
         self._settle()
@@ -401,7 +410,6 @@ class StatusRaces(RuleBasedStateMachine):
         assert not asyncio.all_tasks(self.loop)
         gc.collect()
         assert not self.all_calls
-        self.loop.close()
 
     # For the rules.
 
