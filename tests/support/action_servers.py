@@ -106,7 +106,10 @@ class ActionServerProcess(NodeProcess):
         return [key for key, status in (await self.goals(name)).items() if status < 4]
 
     async def forge(self, name: str, goal_id: UUID) -> None:
-        """Publish bytes on the feedback topic that are not a message, for a goal."""
+        """Publish bytes on the feedback topic that are not a message, for a goal.
+
+        Once, so repeat it: a subscription may know its publisher much later than the reverse.
+        """
         await self.ask("forge", name=name, goal_id=goal_id.hex)
 
     def clear_now(self) -> None:
@@ -228,6 +231,7 @@ class _Servers:
         self._node = node
         self._executor = executor
         self._servers: dict[str, _Server] = {}
+        self._forgers: dict[str, Any] = {}
 
     def serve(self, **options: Any) -> None:
         self._servers[options["name"]] = _Server(self._node, options)
@@ -248,19 +252,16 @@ class _Servers:
         return server.statuses()
 
     def forge(self, name: str, goal_id: str) -> None:
-        feedback = self._servers[name].type.Impl.FeedbackMessage
-        publisher = self._node.create_publisher(feedback, f"{name}/_action/feedback", 10)
-        deadline = time.monotonic() + LIMIT
-        while not publisher.get_subscription_count() and time.monotonic() < deadline:
-            time.sleep(0.01)
-        # More than once, because a subscription may know its publisher later than the reverse.
-        for _ in range(10):
-            publisher.publish(b"\0\1\0\0" + bytes.fromhex(goal_id))
-            publisher.publish(b"\0\1\0\0")
-            time.sleep(0.02)
-        self._node.destroy_publisher(publisher)
+        if name not in self._forgers:
+            feedback = self._servers[name].type.Impl.FeedbackMessage
+            topic = f"{name}/_action/feedback"
+            self._forgers[name] = self._node.create_publisher(feedback, topic, 10)
+        for goal in (bytes.fromhex(goal_id), b""):
+            self._forgers[name].publish(b"\0\1\0\0" + goal)
 
     def clear(self) -> None:
+        while self._forgers:
+            self._node.destroy_publisher(self._forgers.popitem()[1])
         for name in tuple(self._servers):
             self.release(name)
             self.stop(name)
