@@ -311,10 +311,9 @@ class ActionClient:
                 async with asyncio.timeout_at(deadline):
                     await goal.answered.wait()
         except TimeoutError:
+            error = self.timed_out(goal, self._loop.time() - goal.started)
             self._cancellations.abandon(goal)
-            elapsed = self._loop.time() - goal.started
-            what = f"the goal was sent, but not answered within {elapsed:.3g} s; it is cancelled"
-            raise self.errors.goal(GoalTimeout, goal, what) from None
+            raise error from None
         except BaseException:
             self._cancellations.abandon(goal)
             raise
