@@ -70,12 +70,9 @@ async def _doctor(as_json: bool) -> int:
     report.add("python", True, f"{platform.python_version()}, {sys.executable}")
     if _rclpy(report) and _middleware(report):
         environment(report)
-        fast_dds = _is_fast_dds()
-        if fast_dds:
-            _shared_memory(report)
+        _shared_memory(report)
         _multicast(report)
-        if fast_dds:
-            _profile(report)
+        _profile(report)
         if "domain" not in report.failed and _ports(report):
             await _calls(report)
     return Code.FAILED if report.failed else Code.ANSWERED
@@ -114,6 +111,8 @@ def _is_fast_dds() -> bool:
 
 def _shared_memory(report: Report) -> None:
     """Check that Fast DDS can use shared memory; without it, it falls back to UDP."""
+    if not _is_fast_dds():
+        return
     usable = os.access(FOLDER, os.W_OK | os.X_OK)
     free = shutil.disk_usage(FOLDER).free if usable else 0
     files = len(list(FOLDER.glob("fast*")))
@@ -175,6 +174,8 @@ def _multicast(report: Report) -> None:
 
 def _profile(report: Report) -> None:
     """Say which profile of Fast DDS is in use."""
+    if not _is_fast_dds():
+        return
     old = is_old()
     read, other = profile_variable(old), profile_variable(not old)
     if os.environ.get(other) and not os.environ.get(read):

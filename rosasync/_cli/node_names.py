@@ -39,8 +39,10 @@ async def session_for(node: str | None, timeout: float) -> AsyncIterator[rosasyn
         try:
             yield session
         except rosasync.ServiceUnavailable as error:
-            text = str(error)
-            if node is None or "no server has this name" not in text or "no other node" in text:
+            ros_node = session.node
+            # Other errors, such as that of another type, say themselves what is wrong.
+            alone = len(ros_node.get_node_names()) <= 1
+            if node is None or alone or ros_node.count_services(error.srv_name):
                 raise
             raise _explain_missing(session, node, error) from None
 
