@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from matplotlib.figure import Figure
 
 from benchmarks.figures import brief
-from benchmarks.overload import Cell, Plan, measure
+from benchmarks.overload import Cell, Plan, measure, plot
 from benchmarks.pages import markdown_table
 from benchmarks.trials import GOALS, Goal, Trials, check
 
@@ -107,18 +107,8 @@ def draw(trials: Trials) -> Figure:
     cells = [Cell(**found) for found in trials.rows]
     figure = Figure(figsize=(8, 4.2), layout="tight")
     axes = figure.subplots()
-    for name in dict.fromkeys(map(_label, cells)):
-        line = sorted((cell for cell in cells if _label(cell) == name), key=lambda c: c.load)
-        axes.plot([cell.load for cell in line], [cell.goodput for cell in line], "o-", label=name)
-    loads = sorted({cell.load for cell in cells})
-    axes.set_xscale("log")
-    axes.set_xticks(loads, [f"{load:g}" for load in loads])
-    axes.minorticks_off()
+    plot(axes, cells, _label)
     axes.set_title(f"{WORK:g} ms of work, callers that give up after {LIMIT} s", fontsize=10)
-    axes.set_xlabel("calls offered / what the server can do")
-    axes.set_ylabel("answered in time / what the server can do")
-    axes.set_ylim(0.0, 1.1)
-    axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
     return figure
 

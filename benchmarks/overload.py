@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from benchmarks.callers import KINDS
@@ -30,6 +31,7 @@ __all__ = [
     "heading",
     "measure",
     "plans",
+    "plot",
     "row",
     "section",
     "summarize",
@@ -488,22 +490,28 @@ def draw(trials: Trials) -> Figure:
     if cells:
         first = cells[0]
         place = (first.work, first.exponential, first.timeouts, first.processes)
-        same = [c for c in cells if (c.work, c.exponential, c.timeouts, c.processes) == place]
-        for name in dict.fromkeys(map(label, same)):
-            line = sorted((c for c in same if label(c) == name), key=lambda c: c.load)
-            axes.plot([c.load for c in line], [c.goodput for c in line], "o-", label=name)
+        cells = [c for c in cells if (c.work, c.exponential, c.timeouts, c.processes) == place]
         axes.set_title(
             f"{first.work:g} ms of work, timeout {first.timeouts} s, "
             f"{first.processes} client process{'es' if first.processes > 1 else ''}",
             fontsize=10,
         )
-        axes.set_xscale("log")
-        loads = sorted({c.load for c in same})
-        axes.set_xticks(loads, [f"{load:g}" for load in loads])
-        axes.minorticks_off()
+    plot(axes, cells, label)
+    if cells:
         axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    return figure
+
+
+def plot(axes: Axes, cells: Sequence[Cell], label_of: Callable[[Cell], str]) -> None:
+    """Plot the goodput over the offered load, with a line for each label."""
+    for name in dict.fromkeys(map(label_of, cells)):
+        line = sorted((cell for cell in cells if label_of(cell) == name), key=lambda c: c.load)
+        axes.plot([cell.load for cell in line], [cell.goodput for cell in line], "o-", label=name)
+    loads = sorted({cell.load for cell in cells})
+    axes.set_xscale("log")
+    axes.set_xticks(loads, [f"{load:g}" for load in loads])
+    axes.minorticks_off()
     axes.set_xlabel("calls offered / what the server can do")
     axes.set_ylabel("answered in time / what the server can do")
     axes.set_ylim(0.0, 1.1)
     axes.grid(alpha=0.3)
-    return figure
