@@ -65,7 +65,7 @@ class ServerGoals:
         # A goal is in `_askers` until it ends, and then in `_responses` until it expires.
         self._askers: dict[bytes, list[ServiceCall[Any, Any]]] = {}
         self._responses: dict[bytes, Any] = {}
-        # The goals whose result nobody has asked for yet, and when they were accepted.
+        # The goals whose result no client has asked for yet, and when they were accepted.
         self._unasked: dict[bytes, float] = {}
         self._asked = asyncio.Event()
         # Runs when the first of the goals that have ended expires.

@@ -53,7 +53,7 @@ LIMITS = st.builds(
 )
 # Three answers after 0.2 s.
 LEARN: list[Step] = [("work", 0.2, None), *([("call", 1, None), ("wait", 0.3, None)] * 3)]
-# Nobody has time enough, until the server is quick again. Then as many come as there is room for.
+# No caller has time enough, until the server is quick again. Then as many come as have room.
 QUICK_AGAIN: list[Step] = [
     *LEARN,
     ("call", 10, None),
@@ -64,7 +64,7 @@ QUICK_AGAIN: list[Step] = [
     ("wait", 0.3, None),
     ("call", 15, 2000),
 ]
-# Nobody has time enough, and nothing is out.
+# No caller has time enough, and nothing is out.
 PROBE: list[Step] = [*LEARN, ("call", 1, None), ("call", 2, 300), ("call", 2, 500)]
 
 
@@ -176,7 +176,7 @@ class Model:
             assert all(left_of(other, now) <= left for other in others), "others have more time"
 
     def check(self) -> None:
-        """Raise what was wrong, and check that nobody waits for a place that is free."""
+        """Raise what was wrong, and check that no caller waits for a place that is free."""
         check_places(self.service, self.limits)
         with self.noting():
             self.check_waiting()
