@@ -26,18 +26,17 @@ PEER = "call"
 
 
 def conclusions(results: Results) -> Iterator[str]:
-    """Say in a sentence for each scenario how rosasync compares with ``client.call``."""
-    for scenario, (server, metric, _) in PANELS.items():
-        peer = results.of(scenario, PEER)
-        found = {key: ratio(results.of(scenario, key), peer, metric) for key in reversed(OURS)}
+    """Say in a sentence for each scenario what rosasync and ``client.call`` reach."""
+    for scenario, (server, metric, unit) in PANELS.items():
+        peer = figure(results.of(scenario, PEER), metric)
+        found = {key: figure(results.of(scenario, key), metric) for key in reversed(OURS)}
         said = [
-            f"{brief(of.median)} times ({'uvloop' if 'uvloop' in key else 'asyncio'})"
-            for key, of in found.items()
-            if of is not None
+            f"{value:,.0f} on {'uvloop' if 'uvloop' in key else 'asyncio'}"
+            for key, value in found.items()
+            if value is not None
         ]
-        if said:
-            what = "median latency" if metric == "median" else "calls per second"
-            yield f"With {server}: {' and '.join(said)} the {what} of `client.call`."
+        if said and peer is not None:
+            yield f"With {server}, {unit}: {' and '.join(said)}; `client.call` {peer:,.0f}."
 
 
 def headline_rows(results: Results) -> tuple[list[str], list[list[str]]]:

@@ -42,6 +42,12 @@ value. The times are valid for the machine below. The ratios are more portable.
 """
 
 
+TARGETS = """\
+`direct` and `executor` are the two bridges of rosasync. An outcome is the median of the
+rounds, with the lowest and the highest.
+"""
+
+
 def write_report(results: Results, out: Path) -> Path:
     """Write the page and its plots to `out`, and return the path of the page."""
     page = out / "benchmarks.md"
@@ -185,9 +191,8 @@ def _opening(results: Results, out: Path) -> Iterator[str]:
         yield markdown_table(*headline_rows(results))
     goals = list(judge(results))
     if missed := [goal.name for goal in goals if goal.met is False]:
-        yield f"{len(goals) - len(missed)} of {len(goals)} targets are met. Missed: " + (
-            "; ".join(missed) + ".\n"
-        )
+        yield f"{len(goals) - len(missed)} of {len(goals)} targets are met. Missed:\n"
+        yield "\n".join(f"- {name}" for name in missed) + "\n"
 
 
 def _machine(results: Results) -> Iterator[str]:
@@ -213,6 +218,7 @@ def _machine(results: Results) -> Iterator[str]:
 def _targets(results: Results) -> Iterator[str]:
     if body := [goal.row() for goal in judge(results)]:
         yield "## Targets\n"
+        yield TARGETS
         yield markdown_table(GOALS, body)
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 from docutils import nodes
@@ -107,6 +108,24 @@ class SubjectsInIndex(SphinxTransform):
             self.document.insert(0, addnodes.index(entries=entries))
 
 
+WIDE = 500
+"""The width in pixels up to which a picture is readable on a phone."""
+
+
+class WidePictures(SphinxTransform):
+    """Mark the pictures that a phone has to scroll, for `narrow.css`."""
+
+    default_priority = 100  # while the uri is still that of the page
+
+    def apply(self, **kwargs: Any) -> None:
+        """Read the width of each picture from its file."""
+        folder = Path(self.document["source"]).parent
+        for image in self.document.findall(nodes.image):
+            width = re.search(r'<svg[^>]* width="([\d.]+)', (folder / image["uri"]).read_text())
+            if width and float(width[1]) > WIDE:
+                image["classes"].append("wide")
+
+
 class NamesToReferences(SphinxTransform):
     """Link the names in the pages' code spans, such as `session.call`, to the reference."""
 
@@ -162,6 +181,7 @@ def _skip_private(
 def setup(app: Sphinx) -> None:
     """Register the transforms and the two filters of the reference."""
     app.add_transform(SubjectsInIndex)
+    app.add_transform(WidePictures)
     app.add_transform(NamesToReferences)
     app.connect("autodoc-process-signature", _hide_arguments)
     app.connect("autodoc-skip-member", _skip_private)

@@ -13,8 +13,10 @@ import shlex
 import shutil
 import subprocess
 import sys
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from textwrap import indent
@@ -311,6 +313,36 @@ def test_the_plot_of_the_readme_shows_its_table() -> None:
     for _, _, _, *figures, _, _ in rows:
         assert len(figures) == 4
         assert all(f">{figure.strip()}<" in plot for figure in figures), figures
+
+
+@pytest.mark.parametrize("picture", sorted((DOCS / "diagrams").glob("*.svg")), ids=lambda p: p.stem)
+def test_the_texts_of_a_diagram_are_readable(picture: Path) -> None:
+    """No text is cut off by the edge or by another one, as far as its length can be estimated."""
+    svg = picture.read_text()
+    (width,) = re.findall(r'<svg[^>]* width="(\d+)"', svg)
+    rows: defaultdict[float, list[tuple[float, float, str]]] = defaultdict(list)
+    for classes, x, y, text in re.findall(
+        r'<text(?: class="([^"]*)")? x="([\d.]+)" y="([\d.]+)">([^<]+)</text>', svg
+    ):
+        length = len(text) * (7.8 if "code" in classes else 6 if "small" in classes else 6.5)
+        shift = length if "end" in classes else length / 2 if "mid" in classes else 0.0
+        rows[float(y)].append((float(x) - shift, float(x) - shift + length, text))
+    assert rows
+    for row in rows.values():
+        row.sort()
+        assert 0 <= row[0][0] < row[-1][1] <= float(width), row
+        assert all(one[1] < two[0] for one, two in pairwise(row)), row
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/index.md"])
+def test_the_pictures_of_the_first_pages_fit_a_phone(page: str) -> None:
+    """At the 360 px of a phone, text of 13 px in a picture of 500 px is 9 px high."""
+    path = ROOT / page
+    pictures = re.findall(r"!\[[^\]]*\]\(([^)]+\.svg)\)", path.read_text())
+    assert pictures
+    for picture in pictures:
+        (width,) = re.findall(r'<svg[^>]* width="(\d+)"', (path.parent / picture).read_text())
+        assert int(width) <= 500, picture
 
 
 def test_the_links_of_the_readme_lead_somewhere() -> None:

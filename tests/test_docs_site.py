@@ -113,6 +113,9 @@ FIRST = {
 }
 """What is searched for, and the page that has to come first."""
 
+WIDE = {"benchmarks.html": True, "explanation/index.html": True, "index.html": False}
+"""Whether a page has pictures that are scrolled on a phone."""
+
 FEW = 20
 """A search that finds more pages than these does not help."""
 
@@ -218,6 +221,11 @@ def test_the_site(tmp_path: Path) -> None:
         assert not {q: search.stems(q) - section for q in queries if search.stems(q) - section}
 
     assert {query: search.first(query) for query in FIRST} == FIRST
+
+    assert "_static/narrow.css" in (tmp_path / "index.html").read_text()
+    assert "img.wide" in (tmp_path / "_static" / "narrow.css").read_text()
+    wide = {page: 'class="wide"' in (tmp_path / page).read_text() for page in WIDE}
+    assert wide == WIDE
 
     tutorial = (tmp_path / "tutorial.html").read_text()
     assert 'href="reference/session.html#rosasync.Session.call"' in tutorial
