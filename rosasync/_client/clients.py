@@ -90,7 +90,11 @@ class Clients:
     @property
     def free(self) -> int:
         """How many more requests fit into the windows of all clients, matched or not."""
-        return sum(max(client.window.free, 0) for client in self._clients)
+        # No generator, because every call that has to wait comes here.
+        free = 0
+        for client in self._clients:
+            free += max(client.window.free, 0)
+        return free
 
     @property
     def abandoned(self) -> int:

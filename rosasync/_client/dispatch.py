@@ -164,6 +164,8 @@ class Dispatch:
 
     def next_resend(self, client: Client) -> Sent | None:
         """Return the newest attempt of the first call that waits to be sent again by a client."""
+        if not self.resends:
+            return None
         return next((call.newest for call in self.resends if call.client is client), None)
 
     # What is added, and what comes free.
@@ -184,7 +186,8 @@ class Dispatch:
         self.queue[waiter] = None
         if free:
             self.schedule()
-        else:
+        elif not waiting:
+            # The first caller that waits sets them for all.
             self.clients.set_timers()
 
     def start_leased(self, call: Call, now: float) -> None:
@@ -295,6 +298,8 @@ class Dispatch:
                 break
             waiter.start(client, now)
         self._grow_clients()
+        if self.callers_wait():
+            self.clients.set_timers()
 
     def _next_waiter(self, client: Client, now: float) -> Waiter | None:
         """Take the first caller who can be answered in time, and pass over those before.
@@ -302,8 +307,9 @@ class Dispatch:
         A call that is passed over is not ended: it costs nothing, and the server may become quick
         again before its deadline.
         """
-        needed = client.window.expected(now)
-        if self.passed and self._latest - now >= needed:
+        window = client.window
+        if self.passed and window.answers_in(self._latest - now, now):
+            needed = window.expected(now)
             for waiter in tuple(self.passed):
                 if waiter.gone or waiter.deadline is None or waiter.deadline - now >= needed:
                     del self.passed[waiter]
@@ -314,8 +320,9 @@ class Dispatch:
             del self.queue[waiter]
             if waiter.gone:
                 continue
-            if waiter.deadline is None or waiter.deadline - now >= needed:
+            if waiter.deadline is None or window.answers_in(waiter.deadline - now, now):
                 return waiter
+            needed = window.expected(now)
             waiter.passed = (needed, waiter.deadline - now)
             self.overloaded_until = now + max(OVERLOAD, PERSISTENCE * needed)
             self._latest = max(self._latest, waiter.deadline) if self.passed else waiter.deadline
@@ -333,7 +340,7 @@ class Dispatch:
         if now < self.overloaded_until:
             return True
         return call.deadline is not None and (
-            call.deadline - now < call.client.window.expected(now)
+            not call.client.window.answers_in(call.deadline - now, now)
         )
 
     def _run(self) -> None:
@@ -342,8 +349,6 @@ class Dispatch:
             self.assign()
             if self.awaits_match:
                 self._watch.poll_soon()
-            if self.callers_wait():
-                self.clients.set_timers()
 
     def _may_send_again(self, call: Call) -> bool:
         client = call.client

@@ -65,6 +65,7 @@ class Window:
         "_grace",
         "_last_answer",
         "_leaving",
+        "_longest",
         "_outdated",
         "_outdated_since",
         "_pace",
@@ -93,6 +94,8 @@ class Window:
         self.times = ResponseTimes()
         self._grace = grace
         self._recent: deque[Measured] = deque(maxlen=RECENT)
+        # None of them is longer.
+        self._longest = 0.0
         # What they say, until the next answer: one batch of answers lets many callers go.
         self._pace: Pace | None = None
         self._last_answer = 0.0
@@ -209,7 +212,10 @@ class Window:
             self.answered = number
         self.silent_since = now
         seconds = now - sent.at
-        work = now - max(sent.at, self._last_answer)
+        if seconds > self._longest:
+            self._longest = seconds
+        # Both without a call, because every answer comes here.
+        work = seconds if sent.at > self._last_answer else now - self._last_answer
         self._last_answer = now
         self._recent.append((now, seconds, sent.out, work))
         self._pace = None
@@ -266,10 +272,18 @@ class Window:
             sent for sent in self.sent.values() if sent.servers and sent.servers.isdisjoint(servers)
         ]
 
+    def answers_in(self, seconds: float, now: float) -> bool:
+        """Return whether the answer of a request that is sent now is expected in so many seconds.
+
+        Most callers have far more time, and nothing has to be estimated for them.
+        """
+        return seconds >= Pace.LIMIT * self._longest or seconds >= self.expected(now)
+
     def expected(self, now: float) -> float:
         """Return the seconds to the answer of a request that is sent now, at most; 0 if unknown."""
         if self._pace is None or now > self._pace.until:
             self._pace = Pace.of(self._recent, now)
+            self._longest = max((seconds for _, seconds, _, _ in self._recent), default=0.0)
         return self._pace.expected(self.taken + 1)
 
     def due(self, callers_wait: bool, resend: Sent | None) -> float:

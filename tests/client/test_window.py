@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import random
 from collections.abc import Callable, Iterable
+from copy import deepcopy
 from typing import Any
 
 import pytest
@@ -54,6 +56,10 @@ class Bench:
             forgotten += [sent.number for sent in self.window.on_time(self.now, callers, resend)]
         self.now = end
         return forgotten
+
+    def expected(self) -> float:
+        """The estimate of a copy of the window, so that this one stays as it is."""
+        return deepcopy(self.window).expected(self.now)
 
     @property
     def places(self) -> str:
@@ -496,6 +502,20 @@ class TestExpected:
         self.serve(bench, [1.0] * 20, at_once=10)
         self.serve(bench, [0.01] * RECENT, at_once=1)
         assert bench.window.expected(bench.now) < 0.05
+
+    def test_whether_an_answer_comes_in_time_is_what_the_estimate_says(self) -> None:
+        choose = random.Random(1)
+        bench = Bench(size=10)
+        for _ in range(20):
+            # From 1 ms to 10 s, so that old response times are stale.
+            scale = 10 ** choose.uniform(-3, 1)
+            at_once = choose.randint(1, 10)
+            self.serve(bench, [choose.expovariate(1 / scale) for _ in range(30)], at_once)
+            for _ in range(30):
+                bench.now += choose.choice([0.0, 0.0, scale, STALE])
+                needed = bench.expected()
+                for seconds in (0.0, 0.5 * needed, 0.99 * needed, 1.01 * needed, 3.0 * needed):
+                    assert bench.window.answers_in(seconds, bench.now) == (seconds >= needed)
 
     def test_it_is_forgotten_with_the_server_and_after_some_time(self) -> None:
         bench = Bench(size=10)
