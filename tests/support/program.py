@@ -43,7 +43,9 @@ async def run_program(
     Args:
         bridge: the bridge for its sessions.
         program: the program. It prints ``called`` when it has made its first call.
-        send: signals to send it then, a tick apart.
+        send: signals to send it then, a tick apart. Of several, the last is sent again to a
+            program that goes on: a second Ctrl-C may hit asyncio between taking a callback from
+            its queue and running it, and then `asyncio.run` waits for a task that nobody wakes.
         prefix: the beginning of its command line.
     """
     process = await asyncio.create_subprocess_exec(
@@ -62,7 +64,11 @@ async def run_program(
             for number in send:
                 process.send_signal(number)
                 await asyncio.sleep(TICK)
-            _, errors = await process.communicate()
+            ending = asyncio.ensure_future(process.communicate())
+            while not (await asyncio.wait([ending], timeout=LIMIT))[0]:
+                if len(send) > 1:
+                    process.send_signal(send[-1])
+            _, errors = await ending
     finally:
         if process.returncode is None:
             process.kill()
