@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import os
+import subprocess
+from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,6 +14,7 @@ import pytest
 
 from rosasync._ros import host
 from rosasync._ros.discovery import ports_of
+from rosasync._ros.graph import GraphQueries
 from rosasync._ros.host import DISCOVERY_TOPIC, ended
 
 OURS, OTHERS = b"\x01\x0f\x12\x34", b"\x01\x0f\x56\x78"
@@ -23,13 +28,20 @@ def guid(process: int, kind: bytes = OURS) -> bytes:
     )
 
 
-def dead_process() -> int:
-    """Return an id that is no process's, nor ends as one's."""
+def dead_processes() -> Iterator[int]:
+    """Yield ids that are no process's, nor end as one's."""
     alive = {int(name) & 0xFFFF for name in os.listdir("/proc") if name.isdecimal()}
-    return next(number for number in range(1, 0x10000) if number not in alive)
+    return (number for number in range(1, 0x10000) if number not in alive)
 
 
-ME, DEAD = guid(os.getpid()), guid(dead_process())
+ME = guid(os.getpid())
+DEAD, NEXT_DEAD = map(guid, itertools.islice(dead_processes(), 2))
+
+
+class Handle(contextlib.nullcontext[None]):
+    """The handle of a node that is up."""
+
+    pointer = 1
 
 
 class Node:
@@ -37,7 +49,8 @@ class Node:
 
     def __init__(self, *participants: bytes) -> None:
         self.participants = participants
-        self.context = SimpleNamespace(get_domain_id=lambda: DOMAIN)
+        self.context = SimpleNamespace(get_domain_id=lambda: DOMAIN, ok=lambda: True)
+        self.handle = Handle()
 
     def get_name(self) -> str:
         return "me"
@@ -75,7 +88,7 @@ def test_a_process_that_is_no_more() -> None:
 
 @pytest.mark.usefixtures("sockets")
 def test_processes_of_other_hosts_are_not_known() -> None:
-    theirs = guid(dead_process(), OTHERS)
+    theirs = guid(next(dead_processes()), OTHERS)
     assert find(Node(ME, theirs), theirs) == frozenset()
 
 
@@ -88,3 +101,32 @@ def test_a_process_of_a_container_with_this_network_may_be_there(sockets: list[i
 def test_without_sockets_nothing_is_certain(sockets: list[int]) -> None:
     sockets.clear()
     assert find(Node(ME, DEAD), DEAD) == frozenset()
+
+
+@pytest.mark.usefixtures("sockets")
+def test_processes_that_their_parent_has_not_collected() -> None:
+    """A container's first process may collect none."""
+    with contextlib.ExitStack() as stack:
+        started = [stack.enter_context(subprocess.Popen("true")) for _ in range(3)]
+        for process in started:
+            os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+        dead = [guid(process.pid) for process in started]
+        # Not all: a process may be alive whose id ends in the same bits.
+        assert len(find(Node(ME, *dead), *dead)) > 1
+
+
+@pytest.mark.usefixtures("sockets")
+def test_a_participant_that_the_graph_is_losing() -> None:
+    """The server of the first is still there, and what announced its nodes is gone."""
+    assert find(Node(ME, NEXT_DEAD), DEAD, NEXT_DEAD) == {DEAD, NEXT_DEAD}
+
+
+def test_a_process_that_has_ended_stays_so(sockets: list[int]) -> None:
+    """The next server has its socket already when the one before it has crashed, too."""
+    queries = GraphQueries(Node(ME, DEAD, NEXT_DEAD), events=True)
+    assert queries.find_ended(frozenset({DEAD})) == {DEAD}
+    sockets.append(ports_of(DOMAIN)[1])
+    sockets.append(ports_of(DOMAIN)[2])
+    assert queries.find_ended(frozenset({DEAD, NEXT_DEAD})) == {DEAD}
+    del sockets[1:]
+    assert queries.find_ended(frozenset({DEAD, NEXT_DEAD})) == {DEAD, NEXT_DEAD}

@@ -133,6 +133,8 @@ class GraphQueries:
         self._others: dict[str, set[str]] | None = None
         self._served_generation = -1
         self._served_until = 0.0
+        # The servers that were found to have ended. That stays so.
+        self._ended: set[bytes] = set()
 
     def changed(self) -> None:
         """Discard the snapshot of the services. From any thread."""
@@ -170,7 +172,10 @@ class GraphQueries:
     def find_ended(self, servers: Servers) -> Servers:
         """Return those of these servers whose process has certainly ended."""
         with uses_node(self._node):
-            return ended(self._node, (gid for gid in servers if isinstance(gid, bytes)))
+            gids = (gid for gid in servers if isinstance(gid, bytes))
+            found = ended(self._node, gids, self._ended)
+        self._ended |= found
+        return found
 
     def find_publishers(self, topic_name: str) -> frozenset[Hashable]:
         """Identify the publishers of a topic, in all processes."""

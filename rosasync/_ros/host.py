@@ -7,7 +7,8 @@ crash, the graph shows a process until its lease runs out.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Collection, Iterable
+from pathlib import Path
 
 from rclpy.node import Node
 
@@ -22,6 +23,11 @@ HOST = 4
 
 PROCESS = slice(4, 6)
 """The bytes of a GUID with the lower half of the process id, the lowest first (Fast DDS)."""
+
+DEAD_STATES = ("Z", "X", "x")
+"""States of a process that has ended (``man 5 proc``)."""
+THREADS = 17
+"""The position of the number of threads in ``/proc/[pid]/stat``, counted from the state."""
 
 DISCOVERY_TOPIC = "ros_discovery_info"
 """The topic on which each context announces its nodes: one writer for each participant."""
@@ -48,28 +54,59 @@ def participants(node: Node) -> list[bytes]:
     return of_this_host(node, map(gid_of, writers))
 
 
-def ended(node: Node, gids: Iterable[bytes]) -> frozenset[bytes]:
+def ended(
+    node: Node, gids: Iterable[bytes], known: Collection[bytes] = frozenset()
+) -> frozenset[bytes]:
     """Return the GUIDs whose process has certainly ended.
 
     Two signs have to agree. There is no process with this id: but in another container it may have
     another one. And the graph shows more participants than have a socket here: those of a container
-    that shares this host's network have one.
+    that shares this host's network have one. A process that is starting has one, too, before the
+    graph shows it, so what was certain once stays so.
 
     Args:
         node: a node of this process.
         gids: the GUIDs of any endpoints.
+        known: GUIDs of endpoints whose process was found to have ended.
     """
     if not fastdds.is_present():
         return frozenset()
-    alive = {int(name) & 0xFFFF for name in os.listdir("/proc") if name.isdecimal()}
-    missing = [gid for gid in of_this_host(node, gids) if _process_of(gid) not in alive]
+    living = _living_processes()
+    missing = [gid for gid in of_this_host(node, gids) if not living(_process_of(gid))]
     if not missing:
         return frozenset()
     sockets = {port for port, _ in udp_sockets()} & {*ports_of(int(node.context.get_domain_id()))}
-    surplus = len(participants(node)) - len(sockets)
     lost = {gid[:GUID_PREFIX] for gid in missing}
-    return frozenset(missing if sockets and surplus >= len(lost) else ())
+    # The graph loses the endpoints of a participant one by one.
+    shown = {gid[:GUID_PREFIX] for gid in participants(node)} | lost
+    if sockets and len(shown) - len(sockets) >= len(lost):
+        return frozenset(missing)
+    ended_before = {gid[:GUID_PREFIX] for gid in known}
+    return frozenset(gid for gid in missing if gid[:GUID_PREFIX] in ended_before)
 
 
 def _process_of(gid: bytes) -> int:
     return int.from_bytes(gid[PROCESS], "little")
+
+
+def _living_processes() -> Callable[[int], bool]:
+    """Return a test whether a process is alive whose id ends in these 16 bits."""
+    ids: dict[int, list[str]] = {}
+    for name in os.listdir("/proc"):
+        if name.isdecimal():
+            ids.setdefault(int(name) & 0xFFFF, []).append(name)
+    return lambda lower_half: any(map(_is_alive, ids.get(lower_half, ())))
+
+
+def _is_alive(process: str) -> bool:
+    """Return whether a process is more than the entry that its parent has not collected."""
+    try:
+        stat = Path(f"/proc/{process}/stat").read_text()
+    except FileNotFoundError:
+        return False
+    except OSError:
+        return True
+    # The name, in parentheses, may contain anything. The state is the next field.
+    fields = stat.rpartition(")")[2].split()
+    # A process whose first thread has ended looks the same, but for its other threads.
+    return fields[0] not in DEAD_STATES or int(fields[THREADS]) > 1
