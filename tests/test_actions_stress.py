@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import random
+from collections.abc import Callable, Iterable
+from contextlib import AsyncExitStack, suppress
 from typing import TYPE_CHECKING, Any
+from uuid import UUID
 
 import pytest
 from test_msgs.action import Fibonacci
 
 from rosasync import (
     GoalError,
+    GoalRejected,
     GoalStatus,
     GoalTimeout,
     RosasyncError,
@@ -241,3 +245,73 @@ async def test_goals_that_run_take_no_place_in_the_window(
     assert session.core.actions.out == 0
     statuses = (await action_server.goals("/held")).values()
     assert set(statuses) == {GoalStatus.SUCCEEDED}
+
+
+async def test_two_servers_of_one_name(
+    session: Session, action_server: ActionServerProcess
+) -> None:
+    """Both get every goal, and both get every cancellation."""
+    with ActionServerProcess("second") as second:
+        servers = (action_server, second)
+        for server in servers:
+            await server.serve("/twice", hold=True, idle=True)
+        await match_all(session, servers)
+        async with AsyncExitStack() as stack:
+            pursuits = [session.goal(Fibonacci, "/twice") for _ in range(5)]
+            goals = [await stack.enter_async_context(pursuit) for pursuit in pursuits]
+            ids, left = ({goal.id for goal in each} for each in (goals, goals[3:]))
+            for server in servers:
+                await shown(server, lambda statuses: ids <= statuses.keys())
+            for goal in goals[:3]:
+                await goal.cancel()
+            for server in servers:
+                await shown(server, lambda statuses: running(statuses) & ids == left)
+                await server.release("/twice")
+            for goal in goals[3:]:
+                assert len((await goal.result()).sequence) == 0
+
+
+async def test_a_goal_that_one_of_two_servers_rejects_is_cancelled_on_the_other(
+    session: Session, action_server: ActionServerProcess
+) -> None:
+    rejected: set[object] = set()
+    with ActionServerProcess("second") as second:
+        await action_server.serve("/twice", accept=False)
+        await second.serve("/twice", hold=True, idle=True, accept_delay=TICK)
+        async with asyncio.timeout(LIMIT):
+            # The first goals reach only one of them.
+            while not rejected & (await second.goals("/twice")).keys():
+                try:
+                    await session.act(Fibonacci, "/twice", timeout=2 * TICK)
+                except GoalRejected as error:
+                    rejected.add(error.goal_id)
+                    await asyncio.sleep(2 * TICK)
+                except GoalTimeout:
+                    # The other one has accepted it, alone or first.
+                    pass
+        await shown(second, lambda statuses: not running(statuses) & rejected)
+
+
+async def match_all(session: Session, servers: Iterable[ActionServerProcess]) -> None:
+    """Send and cancel goals until each server has cancelled one: the first ones reach only one."""
+    async with asyncio.timeout(LIMIT):
+        for server in servers:
+            while GoalStatus.CANCELED not in (await server.goals("/twice")).values():
+                with suppress(GoalTimeout):
+                    await session.act(Fibonacci, "/twice", timeout=2 * TICK)
+
+
+def running(statuses: dict[UUID, int]) -> set[object]:
+    """Return the goals that have not ended."""
+    return {goal for goal, status in statuses.items() if status < GoalStatus.SUCCEEDED}
+
+
+async def shown(
+    server: ActionServerProcess, condition: Callable[[dict[UUID, int]], object]
+) -> None:
+    """Wait until the goals of a server are as wanted."""
+    for _ in range(100):
+        if condition(statuses := await server.goals("/twice")):
+            return
+        await asyncio.sleep(LIMIT / 100)
+    raise AssertionError(statuses)
