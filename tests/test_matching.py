@@ -7,8 +7,10 @@ from typing import Any
 import pytest
 from nav_msgs.srv import GetPlan
 from rcl_interfaces.srv import SetParameters
-from std_srvs.srv import SetBool
+from std_srvs.srv import SetBool, Trigger
+from test_msgs.action import Fibonacci
 
+from rosasync import ServiceUnavailable
 from rosasync.testing import Graph, StubServer
 from rosasync.testing._matching import matches
 from tests.support.times import TICK
@@ -136,3 +138,17 @@ async def test_answers_that_are_none(ros_graph: Graph) -> None:
 )
 def test_plain_values(expected: Any, actual: Any, fit: bool) -> None:
     assert matches(expected, actual) is fit
+
+
+async def test_a_missing_name_lists_those_of_its_kind(ros_graph: Graph) -> None:
+    async with ros_graph.session() as session:
+        with pytest.raises(ServiceUnavailable, match="the graph has no action$"):
+            await session.act(Fibonacci, "/park", wait=False)
+        ros_graph.stub_action(Fibonacci, "/drive")
+        with pytest.raises(ServiceUnavailable, match="the graph has no service$"):
+            await session.call(Trigger, "/park", wait=False)
+        ros_graph.stub(Trigger, "/stop")
+        with pytest.raises(ServiceUnavailable, match=r"the graph has /stop \(std_srvs/srv/T\w+\)$"):
+            await session.call(Trigger, "/park", wait=False)
+        with pytest.raises(ServiceUnavailable, match=r"the graph has /drive \(test_msgs/\S+\)$"):
+            await session.act(Fibonacci, "/park", wait=False)

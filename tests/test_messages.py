@@ -30,6 +30,7 @@ from sensor_msgs.msg import CameraInfo, Joy, RegionOfInterest
 from sensor_msgs.srv import SetCameraInfo
 from std_msgs.msg import Bool, ByteMultiArray, Int8, Int64, String, UInt8MultiArray, UInt64
 from std_srvs.srv import Empty, SetBool, Trigger
+from test_msgs.action import Fibonacci
 
 from rosasync._ros.messages import make_message, to_dict, to_message
 from rosasync._ros.types import action_type, service_type, type_name
@@ -65,7 +66,9 @@ def test_service_type_of_a_name_is_cached() -> None:
     ("given_type", "message"),
     [
         (Pose, "geometry_msgs/msg/Pose is not a service: it has no Request and Response"),
-        (SetBool.Request, "std_srvs/srv/SetBool_Request is not a service"),
+        (SetBool.Request, "SetBool_Request is not a service: .* the Request of std_srvs/srv/SetB"),
+        (SetBool.Request, "pass SetBool itself$"),
+        (Fibonacci, "Fibonacci is not a service: .*it is an action, for session.act and"),
         (int, "int is not a service"),
         (SetBool.Request(), "or its name .*, got std_srvs/srv/SetBool_Request"),
         (None, "got None"),
@@ -88,6 +91,22 @@ def test_malformed_name_says_the_form(name: str) -> None:
     with pytest.raises(ValueError, match="expected 'package/srv/Type', such as") as caught:
         service_type(name)
     assert repr(name) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [
+        ("/lamp/switch", "; the type comes before the name"),
+        ("std_srvs/SetBool", "; did you mean 'std_srvs/srv/SetBool'?"),
+        ("std_srvs.srv.SetBool", "; did you mean 'std_srvs/srv/SetBool'?"),
+        ("SetBool", "'std_srvs/srv/SetBool'"),
+        ("test_msgs/action/Fibonacci", "'std_srvs/srv/SetBool'"),
+    ],
+)
+def test_malformed_name_says_what_was_meant(name: str, meant: str) -> None:
+    with pytest.raises(ValueError, match="expected 'package/srv/Type', such as") as caught:
+        service_type(name)
+    assert str(caught.value).endswith(meant)
 
 
 @pytest.mark.parametrize(
@@ -114,6 +133,8 @@ def test_unknown_name_says_what_is_there(name: str, message: str) -> None:
         ("test_msgs/srv/Fibonacci", ValueError, "expected 'package/action/Type', such as"),
         ("std_srvs/action/SetBool", ValueError, "the package 'std_srvs' has no actions"),
         (SetBool, TypeError, "std_srvs/srv/SetBool is not an action: it has no Goal, Result and"),
+        (SetBool, TypeError, "it is a service, for session.call and session.serve$"),
+        (Fibonacci.Goal, TypeError, "it is the Goal of test_msgs/action/Fibonacci: pass Fibonacci"),
         (5, TypeError, "expected an action class, or its name such as .*, got int 5"),
     ],
 )

@@ -290,6 +290,11 @@ class TestMisuse:
         with pytest.raises(UsageError, match=r"executor's thread.*from_thread\.submit"):
             await in_callback(session, lambda: session.from_thread.call(ECHO, echo))
 
+    async def test_the_session_itself_on_the_executors_thread(self, session: Session) -> None:
+        """As an ``async def`` callback of rclpy would call it."""
+        with pytest.raises(UsageError, match=r"callback of the node, .*from_thread\.submit"):
+            await in_callback(session, lambda: session.start(ECHO, NAME))
+
     @pytest.mark.parametrize("way", ["result", "exception"])
     async def test_the_executors_thread_waits_for_a_future(
         self, session: Session, held: ServerProcess, way: str

@@ -103,6 +103,11 @@ class Core:
         """Return what is wrong with the caller's loop or thread, and what to do."""
         check_fork()
         name = f"session {self.name!r}"
+        if self.node.executor_thread == threading.get_ident():
+            return (
+                f"{name}: this is a callback of the node, on the executor's thread: "
+                "use session.from_thread.submit(…) here"
+            )
         if not self.gateway.on_thread:
             return f"{name} belongs to the loop of another thread: use session.from_thread here"
         if asyncio._get_running_loop() is None:

@@ -34,6 +34,7 @@ class _Kind:
     parts: tuple[str, ...]
     shape: str
     example: str
+    uses: str
 
     def fits(self, candidate: object) -> bool:
         """Return whether this is a class of the kind."""
@@ -49,7 +50,9 @@ class _Kind:
                 f"got {shown(wanted)}"
             )
         if not self.fits(wanted):
-            raise TypeError(f"{type_name(wanted)} is not {self.a}: it has no {self.shape}")
+            raise TypeError(
+                f"{type_name(wanted)} is not {self.a}: it has no {self.shape}{_instead(wanted)}"
+            )
 
 
 _SERVICE = _Kind(
@@ -59,6 +62,7 @@ _SERVICE = _Kind(
     ("Request", "Response"),
     "Request and Response",
     "std_srvs/srv/SetBool",
+    "session.call and session.serve",
 )
 _ACTION = _Kind(
     "action",
@@ -67,6 +71,7 @@ _ACTION = _Kind(
     ("Goal", "Result", "Feedback", "Impl"),
     "Goal, Result and Feedback",
     "nav2_msgs/action/NavigateToPose",
+    "session.act and session.serve_action",
 )
 
 
@@ -134,7 +139,7 @@ def _named(kind: _Kind, name: str) -> type[Any]:
     if match is None:
         raise ValueError(
             f"{name!r} does not name {kind.a} type: expected 'package/{kind.folder}/Type', "
-            f"such as {kind.example!r}"
+            f"such as {kind.example!r}{_meant(kind, name)}"
         )
     package, wanted = match.groups()
     known: dict[str, type[Any]] = {
@@ -145,6 +150,25 @@ def _named(kind: _Kind, name: str) -> type[Any]:
         names = hint([f"{package}/{kind.folder}/{found}" for found in similar], known)
         raise ValueError(f"{name!r}: no such {kind.noun} in {package}{names}")
     return known[wanted]
+
+
+def _instead(wanted: type[Any]) -> str:
+    """Return the end of an error about a class of another kind: what it is."""
+    for kind in (_SERVICE, _ACTION):
+        if kind.fits(wanted):
+            return f"; it is {kind.a}, for {kind.uses}"
+        whole, _, part = type_name(wanted).rpartition("_")
+        if f"/{kind.folder}/" in whole and part in kind.parts:
+            return f"; it is the {part} of {whole}: pass {whole.rpartition('/')[2]} itself"
+    return ""
+
+
+def _meant(kind: _Kind, name: str) -> str:
+    """Return the end of an error about a malformed name of a type: what was probably meant."""
+    if name.startswith(("/", "~")):
+        return "; the type comes before the name"
+    match = re.fullmatch(rf"([a-z]\w*)[/.](?:{kind.folder}[/.])?([A-Z]\w*)", name, re.ASCII)
+    return f"; did you mean '{match[1]}/{kind.folder}/{match[2]}'?" if match else ""
 
 
 def _load(kind: _Kind, package: str, name: str) -> dict[str, Any]:

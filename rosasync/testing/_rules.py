@@ -14,17 +14,18 @@ __all__ = ["Match", "Rules"]
 
 logger = logging.getLogger("rosasync")
 
-Match: TypeAlias = Mapping[str, Any] | Callable[[Any], bool] | None
-"""Which requests: a mapping of the fields that count, a function of the request, None for all."""
-
 AnswerT = TypeVar("AnswerT")
+AskedT = TypeVar("AskedT")
+
+Match: TypeAlias = Mapping[str, Any] | Callable[[AskedT], bool] | None
+"""Which requests: a mapping of the fields that count, a function of the request, None for all."""
 
 
 @dataclass
 class Rule(Generic[AnswerT]):
     """Answers to the requests that match. A single one is repeated, several are given in turn."""
 
-    match: Match
+    match: Match[Any]
     answers: list[AnswerT]
     repeated: bool
 
@@ -54,7 +55,7 @@ class Rules(Generic[AnswerT]):
         self._on_unexpected = on_unexpected
         self._rules: list[Rule[AnswerT]] = []
 
-    def check(self, name: str, match: Match, answers: tuple[object, ...]) -> None:
+    def check(self, name: str, match: Match[Any], answers: tuple[object, ...]) -> None:
         """Check the arguments of a rule before its answers are prepared.
 
         Raises:
@@ -65,7 +66,7 @@ class Rules(Generic[AnswerT]):
         if isinstance(match, Mapping):
             check_fields(self._request_type, match)
 
-    def add(self, match: Match, answers: list[AnswerT]) -> None:
+    def add(self, match: Match[Any], answers: list[AnswerT]) -> None:
         """Add a rule behind the others."""
         self._rules.append(Rule(match, answers, repeated=len(answers) == 1))
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from typing import TYPE_CHECKING, Any, Generic, Self, TypeAlias
 
@@ -97,7 +96,7 @@ class StubServer(Generic[RequestT, ResponseT]):
 
     # Answers.
 
-    def answer(self, *answers: Answer, match: Match = None) -> Self:
+    def answer(self, *answers: Answer, match: Match[RequestT] = None) -> Self:
         """Answer requests of a server that `Graph.stub` created.
 
         ::
@@ -177,16 +176,10 @@ class StubServer(Generic[RequestT, ResponseT]):
         self._faults.held.clear()
         await self._server.aclose(timeout=0)
 
-    def come_back(self) -> Awaitable[None]:
-        """Enter the graph again, as a node that was restarted; does nothing if it is there.
-
-        To be awaited, as `vanish`. It has come back as soon as this returns.
-        """
+    async def come_back(self) -> None:
+        """Enter the graph again, as a node that was restarted; does nothing if it is there."""
         if self._server.closed:
             self._server = self._open()
-        done = asyncio.get_running_loop().create_future()
-        done.set_result(None)
-        return done
 
     # What was called.
 

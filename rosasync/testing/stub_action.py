@@ -156,7 +156,7 @@ class StubActionServer(Generic[GoalT, ResultT, FeedbackT]):
         *answers: GoalAnswer,
         feedback: Iterable[Any] = (),
         delay: float = 0.0,
-        match: Match = None,
+        match: Match[GoalT] = None,
     ) -> Self:
         """Answer goals of a server that `Graph.stub_action` created.
 

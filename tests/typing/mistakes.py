@@ -13,6 +13,7 @@ from test_msgs.action import Fibonacci
 
 import rosasync
 from rosasync import AsyncActionProxy, AsyncServiceProxy, ServiceCall
+from rosasync.testing import Graph
 
 
 async def calls(session: rosasync.Session) -> None:
@@ -63,6 +64,15 @@ async def servers(session: rosasync.Session) -> None:
         async for call in server:
             print(call.request.dat)  # E: no such field
             call.respond(Trigger.Response())  # E: another type's response
+
+
+def tests(graph: Graph) -> None:
+    stub = graph.stub(SetBool, "/arm/enable")
+    stub.answer({}, match=lambda request: request.dat)  # E: no such field
+    stub.answer({}, match=of_three)  # E: three arguments
+    print(stub.calls[0].request.dat)  # E: no such field
+    graph.serve(SetBool, "/arm/enable", of_another)  # E: another type's messages
+    graph.serve(SetBool, "/arm/enable", of_another_call)  # E: another type's call
 
 
 def threads(session: rosasync.Session) -> None:

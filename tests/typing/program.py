@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
+from collections.abc import Coroutine, Mapping
 from concurrent.futures import Future
 from typing import Any, Literal, assert_type
 
@@ -114,12 +114,25 @@ def ticks(session: rosasync.Session) -> None:
     assert_type(proxy.get_response(), SetBool.Response | None)
 
 
+def respond(request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+    return response
+
+
 async def tests(graph: Graph) -> None:
     stub = graph.stub(SetBool, "/arm/enable", {"success": True})
     assert_type(stub, StubServer[SetBool.Request, SetBool.Response])
     assert_type(stub.calls[0].request, SetBool.Request)
+    stub.answer({}, match=lambda request: bool(assert_type(request, SetBool.Request).data))
     served = graph.serve(SetBool, "/arm/enable", plain)
     assert_type(served, StubServer[SetBool.Request, SetBool.Response])
+    graph.serve(SetBool, "/arm/enable", by_call)
+    graph.serve(SetBool, "/arm/enable", lambda request, response: respond(request, response))
+    async for call in graph.serve(SetBool, "/arm/enable"):
+        assert_type(call, ServiceCall[SetBool.Request, SetBool.Response])
+    restart: list[Coroutine[Any, Any, None]] = [stub.vanish(), stub.come_back()]
+    await asyncio.gather(*restart)
+    base = graph.stub_action(Fibonacci, "/fibonacci", {"sequence": [1]})
+    base.answer(None, match=lambda goal: bool(assert_type(goal, Fibonacci.Goal).order))
     assert_type(graph.stub(NAME, "/arm/enable"), StubServer[Any, Any])
     async with graph.session() as session:
         assert_type(await session.wait_for_service(SetBool, "/arm/enable"), Literal[True])

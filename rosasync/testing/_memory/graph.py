@@ -31,6 +31,10 @@ __all__ = ["MemoryGraph", "MemoryNode", "MemoryQueries", "new_identity", "new_pr
 
 NAME = re.compile(r"/?[a-z_]\w*(/[a-z_]\w*)*", re.ASCII | re.IGNORECASE)
 """A name that ROS allows."""
+SEND_GOAL = re.compile("/_action/send_goal$")
+"""The service that stands for its action in a list."""
+PLAIN = re.compile("^(?!.*/_action/)")
+"""A service that is no part of an action."""
 
 
 _numbers = itertools.count(1)
@@ -129,11 +133,17 @@ class MemoryQueries:
         )
 
     def explain_missing(self, service: Service) -> str:
-        """List the services in the graph, with their types."""
+        """List the services in the graph, or the actions, with their types."""
         if mismatch := self.explain_mismatch(service):
             return mismatch
-        services = {f"{each.srv_name} ({type_name(each.srv_type)})" for each in self._graph.servers}
-        return f"the graph has {', '.join(sorted(services)) or 'no service'}"
+        action = "/_action/" in service.key.srv_name
+        names = [
+            f"{each.srv_name} ({type_name(each.srv_type)})"
+            for each in self._graph.servers
+            if (SEND_GOAL if action else PLAIN).search(each.srv_name)
+        ]
+        nothing = "no action" if action else "no service"
+        return f"the graph has {', '.join(sorted(set(names))) or nothing}"
 
     def explain_mismatch(self, service: Service) -> str | None:
         """Describe the servers of the name as a clause, if all of them have another type."""
