@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import fcntl
 import os
 import signal
@@ -17,9 +18,10 @@ import pytest
 import rosasync
 from rosasync._ros import configuration, fresh_ports
 from rosasync._ros.fresh_ports import LEASE, dead_ports, fresh_offset, port_prefix
+from rosasync._ros.profile import SWITCH
 from tests.support.process import ROOT, ended, first_line
 from tests.support.servers import ServerProcess
-from tests.support.times import LIMIT
+from tests.support.times import LIMIT, TICK, until
 
 EMPTY = "std_srvs/srv/Empty"
 DOMAIN = 3
@@ -230,6 +232,24 @@ async def test_clients_that_are_killed(server: ServerProcess, killed: list[int])
             client.wait()
 
 
+@pytest.mark.faults
+async def test_the_lease_of_a_killed_client_ends(server: ServerProcess, killed: list[int]) -> None:
+    """Its successor goes on."""
+    await server.serve("/left", EMPTY)
+    with ExitStack() as stack:
+        client = start(stack, CLIENT)
+        killed += ports_of_process(client.pid)
+        async with rosasync.Session("successor", timeout=LIMIT) as session:
+            await session.call(EMPTY, "/left")
+            count = session.node.count_clients
+            await until(lambda: count("/left") > 1)
+            client.kill()
+            while count("/left") > 1:
+                await session.call(EMPTY, "/left")
+                await asyncio.sleep(TICK)
+            await session.call(EMPTY, "/left")
+
+
 async def test_servers_that_are_killed(killed: list[int]) -> None:
     async with rosasync.Session("caller", timeout=LIMIT) as session:
         with ExitStack() as stack:
@@ -255,11 +275,14 @@ def test_several_participants_in_a_process(order: str, participants: int) -> Non
     assert first_line(done.stdout.splitlines(True)) == f"{participants}\n"
 
 
-def test_many_processes_at_once() -> None:
+@pytest.mark.parametrize(
+    "count", [6, pytest.param(40, marks=[pytest.mark.faults, pytest.mark.timeout(15 * 60)])]
+)
+def test_many_processes_at_once(count: int) -> None:
     program = SERVER.replace("await asyncio.sleep(3600)", "await asyncio.to_thread(input)")
     with ExitStack() as stack:
         processes = []
-        for _ in range(6):
+        for _ in range(count):
             processes.append(
                 stack.enter_context(
                     subprocess.Popen(
@@ -283,8 +306,50 @@ def test_many_processes_at_once() -> None:
             assert process.returncode == 0
 
 
+@pytest.mark.faults
+async def test_three_hundred_sessions_one_after_another() -> None:
+    for _ in range(300):
+        async with rosasync.Session("one_of_many"):
+            assert len(ports_of_process("self")) == 1
+
+
 async def test_when_none_is_left_a_session_opens(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(configuration, "fresh_offset", lambda *_: None)
+    await call_itself()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("domain", [0, 232])
+def test_a_session_in_the_first_and_in_the_last_domain(domain: int) -> None:
+    [port] = ports_elsewhere({"ROS_DOMAIN_ID": str(domain)})
+    assert 7411 + 250 * domain <= port <= min(65535, 7399 + 250 * (domain + 1))
+
+
+@pytest.mark.slow
+def test_a_session_without_the_profile() -> None:
+    assert len(ports_elsewhere({SWITCH: "off"})) == 1
+
+
+async def call_itself() -> set[int]:
+    """Open a session that calls its own server, and return the ports of the process."""
     async with rosasync.Session("itself", timeout=LIMIT) as session:
         session.serve(EMPTY, "/itself", lambda request, response: response)
         await session.call(EMPTY, "/itself")
+        return ports_of_process("self")
+
+
+def ports_elsewhere(variables: dict[str, str]) -> set[int]:
+    """Do the same in a process with other environment variables."""
+    program = (
+        "import asyncio; from tests.test_fresh_ports import call_itself; "
+        "print(*asyncio.run(call_itself()))"
+    )
+    done = subprocess.run(
+        (sys.executable, "-c", program),
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+        env={**os.environ, **variables},
+        check=True,
+    )
+    return {int(port) for port in first_line(done.stdout.splitlines(True)).split()}
