@@ -301,6 +301,8 @@ async def test_forty_goals_at_once(session: Session, action_server: ActionServer
 async def test_wrong_arguments_raise_before_anything_is_sent(session: Session) -> None:
     with pytest.raises(TypeError, match="expected test_msgs/action/Fibonacci_Goal"):
         await session.act(Fibonacci, "/fibonacci", Fibonacci.Result())
+    with pytest.raises(TypeError, match="on_feedback must be callable, not int"):
+        await session.act(Fibonacci, "/fibonacci", on_feedback=3)  # type: ignore[call-overload]
     with pytest.raises(ValueError, match="ordr"):
         session.goal(Fibonacci, "/fibonacci", {"ordr": 1})
     with pytest.raises(ValueError, match="feedback must be at least 1"):

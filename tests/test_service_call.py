@@ -147,7 +147,9 @@ class TestCall:
         assert server.statistics().dropped == 1
         assert server.statistics().unanswered == 0
 
-    async def test_dropped_unanswered(self, session: Session) -> None:
+    async def test_dropped_unanswered(
+        self, session: Session, caplog: pytest.LogCaptureFixture
+    ) -> None:
         server = session.serve(ECHO, "/mute", lambda call: None)
         task = ask(session, "/mute", "text", timeout=2 * TICK)
         with pytest.warns(ResourceWarning, match="/mute: a call was dropped unanswered"):
@@ -156,6 +158,11 @@ class TestCall:
         statistics = server.statistics()
         assert (statistics.taken, statistics.deferred, statistics.dropped) == (1, 1, 1)
         assert statistics.unanswered == statistics.responded == 0
+        with pytest.warns(ResourceWarning, match="/mute"), pytest.raises(ResponseTimeout):
+            await ask(session, "/mute", "text", timeout=2 * TICK)
+        await until(lambda: server.statistics().dropped == 2)
+        said = [r for r in caplog.records if "a call was dropped unanswered" in r.getMessage()]
+        assert len(said) == 1, "it is said once for each server"
 
     async def test_dropped_unanswered_in_another_thread(
         self, session: Session, holder: Holder

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from rosasync._server.handler_tasks import Spawn
     from rosasync.tracing import ServerTrace
 
-__all__ = ["ResponseSender", "service_destroyed"]
+__all__ = ["COLLECTED", "ResponseSender", "service_destroyed"]
 
 logger = logging.getLogger("rosasync")
 
@@ -32,6 +32,12 @@ DELIVERY_TIME = 0.5
 of lost packets take several of the middleware's heartbeats (20 ms, or 3 s by its own default)."""
 DELIVERY_INTERVAL = 0.01
 """Seconds between two queries whether the last responses were received."""
+
+COLLECTED = (
+    "a call was dropped unanswered, so its client gets no response: keep the call, and call its "
+    "respond() once"
+)
+"""What is wrong with a call that is garbage-collected unanswered."""
 
 
 class ResponseSender(Generic[ResponseT]):
@@ -60,6 +66,7 @@ class ResponseSender(Generic[ResponseT]):
         self.name = name
         self.response_type = response_type
         self.lock = threading.RLock()
+        self._warned = False
         self.ending: Callable[[], Exception] | None = None
         self._type_name = type_name
         self._from_mapping = from_mapping
@@ -233,6 +240,10 @@ class ResponseSender(Generic[ResponseT]):
             # Otherwise `close` has counted the call.
             if self.ending is None:
                 self._counts.dropped += 1
+        if not self._warned:
+            # Python hides the ResourceWarning, unless it is asked for it.
+            self._warned = True
+            logger.warning("%s: %s. This is reported once for each server", self.name, COLLECTED)
         if trace is not None:
             trace.end_unanswered()
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from time import monotonic_ns
 from typing import TYPE_CHECKING, Any, Generic, Protocol
 
-from rosasync._server.sending import ResponseSender
+from rosasync._server.sending import COLLECTED, ResponseSender
 from rosasync._status.wire import Outcome
 from rosasync.typing import RequestT, ResponseT
 
@@ -126,8 +126,7 @@ class ServiceCall(Generic[RequestT, ResponseT]):
             if self.status is not None:
                 self.status.report(Outcome.FAILED)
             warnings.warn(
-                f"{self._sender.name}: a call was dropped unanswered, so its client gets no "
-                "response: keep the call, and call its respond() once",
+                f"{self._sender.name}: {COLLECTED}",
                 ResourceWarning,
                 source=self,
                 stacklevel=2,
