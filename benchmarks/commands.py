@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -174,20 +174,30 @@ def fail(
 
 
 def start(
-    programs: Annotated[str, typer.Option(help="These programs.")] = ",".join(cold.PROGRAMS),
+    programs: Annotated[
+        str, typer.Option(help=f"These programs, instead of {', '.join(cold.PROGRAMS)}.")
+    ] = "",
     processes: Annotated[int, typer.Option(min=1, help="Processes of each program.")] = 50,
     after_crash: Annotated[
-        bool, typer.Option("--after-crash", help="Kill and replace clients, and servers, instead.")
+        bool,
+        typer.Option(
+            "--after-crash",
+            help="Kill and replace clients, and servers, instead. The programs are "
+            f"{', '.join(crash.CONTESTANTS)}.",
+        ),
     ] = False,
+    places: Annotated[
+        str, typer.Option(help=f"Where they are killed: {', '.join(crash.PLACES)}.")
+    ] = crash.LOCALHOST,
     before: Before = None,
     json: Json = None,
 ) -> None:
     """From the start of a process to its first answer."""
     if after_crash:
-        replace(processes, before, json)
+        replace(split(programs) or crash.CONTESTANTS, split(places), processes, before, json)
         return
     with checked():
-        chosen = cold.check_programs(split(programs))
+        chosen = cold.check_programs(split(programs) or [*cold.PROGRAMS])
     isolate()
     trials = Trials(cold.COMMAND, {"processes": processes})
     total = processes * len(chosen)
@@ -196,14 +206,29 @@ def start(
     make_console().print(make_table("", cold.heading, cold.rows(starts)))
 
 
-def replace(restarts: int, before: Path | None, json: Path | None) -> None:
+def replace(
+    programs: Sequence[str],
+    places: Sequence[str],
+    restarts: int,
+    before: Path | None,
+    json: Path | None,
+) -> None:
     """Measure processes that replace killed ones."""
-    chosen = crash.check_contestants(crash.CONTESTANTS, before)
+    with checked():
+        chosen = crash.check_contestants(programs, before)
+        crash.check_places(places)
     isolate()
     trials = Trials(crash.COMMAND, {"restarts": restarts})
-    total = 2 * restarts * len(chosen)
+    total = len(places) * len(crash.SIDES) * restarts * len(chosen)
+    found = []
     with collected(trials, None, None, total, json) as add:
-        found = crash.measure(chosen, restarts, before, add)
+        for name in places:
+            try:
+                with crash.placed(name) as place:
+                    found += crash.measure(chosen, restarts, place, before, add)
+            except NoHosts as reason:
+                trials.skipped[name] = str(reason)
+                typer.echo(f"{name}: {reason}")
     make_console().print(make_table("", crash.heading, crash.rows(found)))
 
 

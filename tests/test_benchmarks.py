@@ -219,6 +219,10 @@ def test_the_cells_of_a_command_are_checked(tmp_path: Path) -> None:
     assert faults.plans([faults.SLOW], ["before"], tmp_path) == [(faults.SLOW, "before")]
     with pytest.raises(ValueError, match="no program stock"):
         cold.check_programs(["stock"])
+    with pytest.raises(ValueError, match="no contestant rclpy; there are stock, "):
+        crash.check_contestants(["stock", "rclpy"], None)
+    with pytest.raises(ValueError, match="no place Mars; there are LOCALHOST, "):
+        crash.check_places(["SUBNET", "Mars"])
 
 
 def test_the_goals_of_sharing() -> None:
@@ -304,11 +308,13 @@ def test_actions_are_measured() -> None:
 def test_trials_are_published_between_their_marks(tmp_path: Path) -> None:
     machine = {**MACHINE, "versions": {"rclpy": "7"}}
     starts = [cold.Start("rosasync script", 0.5), cold.Start("rosasync script", None)]
+    restarts = [crash.Restart("client", "stock", seconds) for seconds in (2.5, None)]
+    restarts.append(crash.Restart("server", "stock", 0.5, "SUBNET"))
     kinds: list[tuple[str, list[Any]]] = [
         ("sharing", [cell("direct", [5]), cell("direct", [5, 4])]),
         ("faults", [faults.Fault(faults.SLOW, "direct", 8, 1.0, {"answered": 24}, plain_lost=0)]),
         ("cold", starts),
-        ("crash", [crash.Restart("client", "stock", 2.5), crash.Restart("client", "stock", None)]),
+        ("crash", restarts),
         ("actions", [figure(actions.ONE, "rosasync", 3.0), figure(actions.ONE, "stock", 6.0)]),
     ]
     files: list[Path] = []
@@ -329,6 +335,7 @@ def test_trials_are_published_between_their_marks(tmp_path: Path) -> None:
     assert "| rosasync | 2 | 1 | 0 | 0.00 | 9.00 | 4 | 0.99 | 1.00 | 2.00 |  |" in text
     written = {path.name for path in (tmp_path / "benchmarks").iterdir()}
     assert "| stock | client | 2 | 2.50 | 2.50 | 1 | 1 |" in text
+    assert "| stock | server, SUBNET | 1 | 0.50 | 0.50 | 0 | 0 |" in text
     assert written == {"sharing.svg", "cold.svg"}
     assert "| goal to result, ms | stock | 3 | 6 | 0.5 |" in text
     assert len(pages.marked_sections(text)) == 5
@@ -359,7 +366,10 @@ SMALL_RUNS = {
     "sharing": ("--contestants=direct,semaphore", "--processes=2", "--work=1", "--seconds=0.3"),
     "faults": ("--situations=slow server", "--contestants=direct-retry"),
     "cold": ("--processes=1",),
-    "crash": ("--after-crash", "--processes=1"),
+    "crash": (
+        *("--after-crash", "--processes=1", "--programs=rosasync"),
+        "--places=LOCALHOST,SUBNET",
+    ),
 }
 
 
@@ -394,6 +404,9 @@ def test_a_small_run(command: str, tmp_path: Path) -> None:
         assert faults.Fault(**trials.rows[0]).answered
     else:
         assert all(row["seconds"] for row in trials.rows)
+    if command == "crash":
+        assert {row["place"] for row in trials.rows} == {"LOCALHOST", "SUBNET"}
+        assert {row["side"] for row in trials.rows} == {*crash.SIDES}
 
 
 def overload_cell(

@@ -17,8 +17,9 @@ import pytest
 
 from rosasync._demo.run import TURNS, Report, Samples
 from rosasync._demo.stock import READY
+from tests.support.hosts import own_shared_memory
 from tests.support.process import ended
-from tests.support.program import as_root, own_shared_memory
+from tests.support.program import as_root
 
 LIMIT = 120.0
 ROSASYNC = (sys.executable, "-m", "rosasync")

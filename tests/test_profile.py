@@ -15,10 +15,10 @@ from xml.etree import ElementTree
 import pytest
 
 from rosasync._ros import configuration, fastdds, profile
-from tests.support.hosts import NoHosts
+from tests.support.hosts import NoHosts, own_shared_memory
 from tests.support.lossy import LossyHosts
 from tests.support.process import first_line, own
-from tests.support.program import as_root, own_shared_memory
+from tests.support.program import as_root
 from tests.support.times import LIMIT, TICK, until
 
 ROOT = Path(__file__).parents[1]

@@ -13,8 +13,9 @@ import rosasync
 from rosasync._ros.profile import SWITCH
 from tests.support.command import json_lines
 from tests.support.command import rosasync as command
+from tests.support.hosts import own_shared_memory
 from tests.support.process import ROOT, ended, first_line
-from tests.support.program import as_root, own_shared_memory
+from tests.support.program import as_root
 from tests.support.times import LIMIT, TICK
 
 pytestmark = pytest.mark.slow

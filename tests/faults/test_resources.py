@@ -10,7 +10,8 @@ from __future__ import annotations
 import pytest
 
 from tests.faults.trial import Trial
-from tests.support.program import as_root, own_shared_memory, run_program
+from tests.support.hosts import own_shared_memory
+from tests.support.program import as_root, run_program
 
 pytestmark = pytest.mark.slow
 

@@ -8,7 +8,15 @@ import subprocess
 from contextlib import ExitStack
 from types import TracebackType
 
-__all__ = ["ENVIRONMENT", "Hosts", "NoHosts", "bring_up", "check_namespaces", "run_ip"]
+__all__ = [
+    "ENVIRONMENT",
+    "Hosts",
+    "NoHosts",
+    "bring_up",
+    "check_namespaces",
+    "own_shared_memory",
+    "run_ip",
+]
 
 ENVIRONMENT = {
     "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",
@@ -89,3 +97,9 @@ def run_ip(*arguments: str) -> None:
     done = subprocess.run(["ip", *arguments], capture_output=True, text=True, check=False)
     if done.returncode:
         raise NoHosts(f"`ip {' '.join(arguments)}` failed: {done.stderr.strip()}")
+
+
+def own_shared_memory(size: str) -> tuple[str, ...]:
+    """Return the beginning of a command line: what it starts has a ``/dev/shm`` of its own."""
+    mount = f'mount -t tmpfs -o size={size} tmpfs /dev/shm && exec "$@"'
+    return ("unshare", "--mount", "sh", "-c", mount, "sh")

@@ -13,7 +13,7 @@ import pytest
 from tests.support.process import ROOT, own
 from tests.support.times import LIMIT, TICK
 
-__all__ = ["as_root", "own_shared_memory", "run_program"]
+__all__ = ["as_root", "run_program"]
 
 as_root = pytest.mark.skipif(
     os.geteuid() != 0, reason="needs root, to mount a small /dev/shm or to give up its privileges"
@@ -77,9 +77,3 @@ async def run_program(
     text = own(errors.decode())
     assert "terminate called" not in text
     return process.returncode, text
-
-
-def own_shared_memory(size: str) -> tuple[str, ...]:
-    """Return the beginning of a command line: what it starts has a ``/dev/shm`` of its own."""
-    mount = f'mount -t tmpfs -o size={size} tmpfs /dev/shm && exec "$@"'
-    return ("unshare", "--mount", "sh", "-c", mount, "sh")
