@@ -116,6 +116,7 @@ def test_template_is_a_request_to_edit_and_send() -> None:
         pytest.param((LAMP, LAMP_TYPE, "@/no/such/file"), 2, "cannot read", id="file"),
         pytest.param((LAMP, "no_msgs/srv/Type", "{}"), 2, "ros-<distribution>-no-msgs", id="type"),
         pytest.param(("not a name", LAMP_TYPE), 2, "'not_a_name' is a valid one", id="name"),
+        pytest.param((LAMP_TYPE, LAMP), 2, "give the name first, and then the type", id="order"),
         pytest.param((LAMP, "--count", "0"), 2, "rosasync call --help", id="usage"),
         pytest.param((LAMP, "--field", "nothing"), 2, "there is success, message", id="path"),
         pytest.param(("/lamp/none", LAMP_TYPE, "--timeout", "1"), 3, "rosasync why", id="none"),

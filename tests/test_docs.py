@@ -345,6 +345,15 @@ def test_the_pictures_of_the_first_pages_fit_a_phone(page: str) -> None:
         assert int(width) <= 500, picture
 
 
+def test_siblings_have_titles_alike_and_are_listed() -> None:
+    how_to = {page.name: page.read_text() for page in (DOCS / "how-to").glob("*.md")}
+    index = how_to.pop("index.md")
+    assert [name for name, text in how_to.items() if not text.startswith("# How to ")] == []
+    assert [name for name in how_to if f"]({name})" not in index] == []
+    examples = [page.read_text() for page in (DOCS / "examples").glob("*/README.md")]
+    assert [text[:40] for text in examples if not text.startswith("# A ")] == []
+
+
 def test_the_links_of_the_readme_lead_somewhere() -> None:
     links = re.findall(r"\]\((docs/[^)#]+)", (ROOT / "README.md").read_text())
     assert len(links) > 10

@@ -9,6 +9,8 @@ import sys
 from collections.abc import AsyncIterator, Iterator
 from typing import Any
 
+import typer
+
 from rosasync._cli.documents import DocumentError, documents, plain, read_message
 from rosasync._cli.emitter import dump_yaml
 from rosasync._cli.errors import CliError, join
@@ -25,7 +27,13 @@ TOO_LARGE = f"a document of standard input is larger than {MAX_BYTES // 1024**2}
 
 
 def split_type(srv_type: str | None, text: str | None) -> tuple[str | None, str | None]:
-    """Tell the type from the request where only one of the two was given."""
+    """Tell the type from the request where only one of the two was given.
+
+    Raises:
+        typer.BadParameter: it is the name, which comes first.
+    """
+    if srv_type is not None and re.fullmatch(r"(/\w+)+", srv_type):
+        raise typer.BadParameter(f"{srv_type!r} is a name: give the name first, and then the type")
     if text is None and srv_type is not None and not re.fullmatch(r"[\w]+(/\w+)+", srv_type):
         return None, srv_type
     return srv_type, text
