@@ -9,10 +9,10 @@ from collections.abc import AsyncIterator
 import pytest
 from test_msgs.action import Fibonacci
 
-from rosasync import GoalStatus, ServerGone
+from rosasync import GoalStatus, ServerGone, Session
 from rosasync._actions.active_goal import ActiveGoal
 from rosasync._actions.active_goals import LINGER, TICK, ActiveGoals
-from rosasync._actions.cancellation import CancelAnswer, Step, next_step
+from rosasync._actions.cancellation import END_TIMEOUT, CancelAnswer, Step, next_step
 from rosasync._actions.result_plan import (
     ENDED_ASK,
     ENDED_PATIENCE,
@@ -172,6 +172,89 @@ async def test_a_server_vanishes_before_its_acceptance_arrives(
         server.vanish()
         with pytest.raises(ServerGone, match="every server vanished"):
             await task
+
+
+@pytest.mark.parametrize("leaves", [False, True])
+async def test_a_goal_of_a_server_that_was_cut_off_is_cancelled_when_it_is_back(
+    fake_graph: FakeGraph, virtual_clock: VirtualClock, server: ScriptedAction, leaves: bool
+) -> None:
+    async with fake_graph.session() as session:
+        task = asyncio.create_task(session.act(Fibonacci, "/fibonacci"))
+        await virtual_clock.advance(0.1)
+        server.answer_send(0)
+        await virtual_clock.advance(0.1)
+        if leaves:
+            task.cancel()
+        server.cut()
+        with pytest.raises(asyncio.CancelledError if leaves else ServerGone):
+            await virtual_clock.skip(task)
+        await virtual_clock.advance(0.8 * END_TIMEOUT)
+        server.prompt = True
+        server.come_back()
+        await virtual_clock.advance(0.1)
+        assert list(server.statuses.values()) == [GoalStatus.CANCELED]
+        await virtual_clock.advance(0.2 * END_TIMEOUT)
+        assert session.core.actions.out == 0
+
+
+async def test_a_goal_whose_acceptance_was_cut_off_is_cancelled_when_its_server_is_back(
+    fake_graph: FakeGraph, virtual_clock: VirtualClock, server: ScriptedAction
+) -> None:
+    async with fake_graph.session() as session:
+        task = asyncio.create_task(session.act(Fibonacci, "/fibonacci"))
+        await virtual_clock.advance(0.1)
+        with fake_graph.drop_responses():
+            server.answer_send(0)
+        server.cut()
+        with pytest.raises(ServerGone):
+            await virtual_clock.skip(task)
+        server.prompt = True
+        server.come_back()
+        await virtual_clock.advance(1.0)
+        assert list(server.statuses.values()) == [GoalStatus.CANCELED]
+        assert session.core.actions.out == 0
+
+
+async def test_a_server_that_does_not_come_back_is_not_warned_of(
+    fake_graph: FakeGraph,
+    virtual_clock: VirtualClock,
+    server: ScriptedAction,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    async with fake_graph.session() as session:
+        task = asyncio.create_task(session.act(Fibonacci, "/fibonacci"))
+        await virtual_clock.advance(0.1)
+        server.answer_send(0)
+        await virtual_clock.advance(0.1)
+        server.vanish()
+        with pytest.raises(ServerGone):
+            await virtual_clock.skip(task)
+        await virtual_clock.advance(1.1 * END_TIMEOUT)
+        assert session.core.actions.out == 0
+    assert not caplog.records
+
+
+async def test_a_detached_goal_of_a_server_that_was_cut_off_runs_on(
+    fake_graph: FakeGraph, virtual_clock: VirtualClock, server: ScriptedAction
+) -> None:
+    async with fake_graph.session() as session:
+        pursuit = asyncio.create_task(detach(session))
+        await virtual_clock.advance(0.1)
+        server.answer_send(0)
+        await virtual_clock.advance(0.1)
+        server.cut()
+        with pytest.raises(ServerGone):
+            await virtual_clock.skip(pursuit)
+        server.prompt = True
+        server.come_back()
+        await virtual_clock.advance(1.0)
+        assert list(server.statuses.values()) == [GoalStatus.EXECUTING]
+
+
+async def detach(session: Session) -> None:
+    async with session.goal(Fibonacci, "/fibonacci") as goal:
+        goal.detach()
+        await goal.result()
 
 
 async def test_a_new_server_that_the_graph_does_not_report(virtual_clock: VirtualClock) -> None:

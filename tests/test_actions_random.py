@@ -23,6 +23,7 @@ from rosasync import (
     Session,
     SessionClosed,
 )
+from rosasync._actions.client import GONE_DELAY
 from rosasync.testing import VirtualClock
 from tests.support.fake_graph import FakeGraph
 from tests.support.scripted_action import ScriptedAction
@@ -38,6 +39,9 @@ EXPECTED = (
     asyncio.CancelledError,
 )
 
+LONGEST_CUT = 50.0
+"""Seconds without a server after which its goals are not expected to be cancelled any more."""
+
 
 class Run:
     """A session with its callers, a scripted server, and one step after another."""
@@ -48,6 +52,7 @@ class Run:
         self.server = server
         self.clock = VirtualClock()
         self.there = True
+        self.cut_for = 0.0
         self.detached: set[bytes] = set()
         self.tasks: list[asyncio.Task[None]] = []
         self.results = 0
@@ -71,9 +76,11 @@ class Run:
             "status": server.publish_status,
         }
         if kind == "vanish":
-            self.vanish_or_come_back()
+            self.vanish_or_come_back(cut=bool(number % 2))
         elif kind == "wait":
-            await self.clock.advance((0.01, 0.3, 3.0, 30.0)[number % 4])
+            seconds = (0.01, 0.3, 3.0, 30.0)[number % 4]
+            await self.clock.advance(seconds)
+            self.cut_for += 0.0 if self.there else seconds
         else:
             steps[kind]()
         for _ in range(number % 5):
@@ -82,10 +89,12 @@ class Run:
     def start(self, work: Any) -> None:
         self.tasks.append(asyncio.create_task(work))
 
-    def vanish_or_come_back(self) -> None:
+    def vanish_or_come_back(self, cut: bool = False) -> None:
         if self.there:
-            self.server.vanish()
+            self.server.cut() if cut else self.server.vanish()
         else:
+            if self.cut_for > LONGEST_CUT:
+                self.server.statuses.clear()
             self.server.come_back()
         self.there = not self.there
 
@@ -135,6 +144,8 @@ class Run:
         self.server.prompt = True
         if not self.there:
             self.vanish_or_come_back()
+        # A session that has seen no server for a moment closes without it.
+        await self.clock.advance(2 * GONE_DELAY)
         self.server.answer_all()
         if not close:
             for task in self.tasks:

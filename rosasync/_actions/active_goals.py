@@ -52,9 +52,10 @@ class ActiveGoals:
         self._goals[goal.key] = goal
 
     def remove(self, goal: ActiveGoal) -> bool:
-        """Remove a goal; return whether it was out."""
-        if self._goals.pop(goal.key, None) is None:
+        """Remove a goal; return whether it was out, rather than another one of its UUID."""
+        if self._goals.get(goal.key) is not goal:
             return False
+        del self._goals[goal.key]
         if not self._goals:
             self._set_timer(LINGER)
         return True

@@ -6,6 +6,7 @@ import asyncio
 import enum
 import logging
 from collections.abc import Callable
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from rosasync._actions.status import GoalStatus, uuid_of
@@ -160,7 +161,17 @@ class Cancellations:
                 if await self._insist(goal):
                     await goal.settled.wait()
         except TimeoutError:
-            if goal.status is not GoalStatus.CANCELING:
+            self._warn(goal)
+        except ContextShutdown:
+            self._on_shutdown()
+        except SessionClosed:
+            pass
+        self._on_left(goal)
+
+    def _warn(self, goal: ActiveGoal) -> None:
+        """Warn that a goal may run on, unless its server is gone as well."""
+        with suppress(ContextShutdown):
+            if goal.status is not GoalStatus.CANCELING and self._watch.exists():
                 logger.warning(
                     "%s: goal %s, whose caller has left, could not be cancelled within %g s, and "
                     "may run on: look after the server",
@@ -168,11 +179,6 @@ class Cancellations:
                     goal.id,
                     END_TIMEOUT,
                 )
-        except ContextShutdown:
-            self._on_shutdown()
-        except SessionClosed:
-            pass
-        self._on_left(goal)
 
     async def _insist(self, goal: ActiveGoal) -> bool:
         """Cancel a goal by its UUID, at once, and again until that is settled.

@@ -18,7 +18,14 @@ from rosasync._actions.status import TERMINAL, GoalStatus
 from rosasync._actions.topics import ActionTopics
 from rosasync._core.aio import start_task
 from rosasync._core.text import count
-from rosasync.errors import CallError, ContextShutdown, GoalRejected, GoalTimeout
+from rosasync.errors import (
+    CallError,
+    ContextShutdown,
+    GoalRejected,
+    GoalTimeout,
+    ServerGone,
+    SessionClosed,
+)
 
 if TYPE_CHECKING:
     from rosasync._client.pool import ClientPool, LeasedClient
@@ -220,6 +227,18 @@ class ActionClient:
 
     def _fail(self, goal: ActiveGoal, error: Exception) -> None:
         self._settle(goal, Outcome(goal.status, make_error=lambda: error))
+        if isinstance(error, ServerGone) and not goal.detached:
+            # If only the network was cut, the server still has the goal when it is matched again.
+            self._cancel_failed(goal)
+
+    def _cancel_failed(self, goal: ActiveGoal) -> None:
+        """Cancel a goal that has ended for its callers, but may run on a server."""
+        other = ActiveGoal(goal.id, goal.started)
+        other.update(GoalStatus.ACCEPTED)
+        with suppress(SessionClosed, ContextShutdown):
+            self._add(other)
+            self._ask(other)
+            self._cancellations.abandon(other)
 
     def _let_go(self, goal: ActiveGoal) -> None:
         """Forget a goal whose caller has left, and for which nothing is left to do."""
@@ -300,7 +319,11 @@ class ActionClient:
             if response.accepted:
                 self._accepted(goal, response.stamp)
             else:
-                self._rejected(goal)
+                what = "the server rejected the goal"
+                self._fail(goal, self.errors.goal(GoalRejected, goal, what))
+                if not self._watch.is_single():
+                    # Another server of the name may have accepted it.
+                    self._cancel_failed(goal)
         finally:
             goal.answered.set()
             await lease.aclose()
@@ -336,16 +359,6 @@ class ActionClient:
                 goal.servers |= self._watch.servers_now()
                 self._expect_loss((goal,))
         goal.answered.set()
-
-    def _rejected(self, goal: ActiveGoal) -> None:
-        self._fail(goal, self.errors.goal(GoalRejected, goal, "the server rejected the goal"))
-        if not self._watch.is_single():
-            # Another server of the name may have accepted it.
-            other = ActiveGoal(goal.id, goal.started)
-            other.update(GoalStatus.ACCEPTED)
-            self._add(other)
-            self._ask(other)
-            self._cancellations.abandon(other)
 
     # Their results, and what takes their place.
 

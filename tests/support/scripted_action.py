@@ -70,17 +70,22 @@ class ScriptedAction:
 
     def vanish(self) -> None:
         """Leave the graph, with every goal and request."""
+        self.cut()
+        self.cancels.clear()
+        self.asks.clear()
+        self.statuses.clear()
+
+    def cut(self) -> None:
+        """Leave the graph as if the network were cut: its goals run on, those sent are lost."""
         for service in (self._send, self._cancel, self._result):
             service.stop()
             service.close()
         for publisher in (self._feedback, self._status):
             publisher.close()
-        for held in (self.sends, self.cancels, self.asks):
-            held.clear()
-        self.statuses.clear()
+        self.sends.clear()
 
     def come_back(self) -> None:
-        """Be there as another server, without any goal."""
+        """Be there again, with the goals it still has. For the graph it is another server."""
         self._open()
 
     def close(self) -> None:
@@ -138,6 +143,8 @@ class ScriptedAction:
             self._end(key, status)
 
     def publish_feedback(self, number: int) -> None:
+        if self._feedback.closed:
+            return
         for key in _pick(list(self.statuses), number):
             message = Impl.FeedbackMessage()
             message.goal_id.uuid = list(key)
