@@ -16,6 +16,10 @@ __all__ = ["GraphWatch", "Watcher"]
 
 POLL_MIN = 0.002
 """Seconds until the first poll for a match, which takes milliseconds."""
+POLL_GROWTH = 1.1
+"""Each poll comes later than the one before by this factor, so a match that takes long is noticed
+after about a tenth of that time at most: Fast DDS waits 0.3 s if it opens a port while it cannot
+tell whether the port's reader is alive."""
 POLL_MAX = 0.25
 """Maximum number of seconds between two polls while callers wait for a match."""
 POLL_CONTEXT = 0.5
@@ -128,7 +132,7 @@ class GraphWatch:
         if self._timer is not None or self._closed:
             return
         if any(service.awaits_match for service in self._services):
-            self._delay = min(self._delay * 2, POLL_MAX)
+            self._delay = min(self._delay * POLL_GROWTH, POLL_MAX)
             self._poll_in(self._delay)
         elif any(service.is_busy for service in self._services):
             self._poll_in(POLL_CONTEXT)
