@@ -12,6 +12,7 @@ from diagnostic_msgs.srv import AddDiagnostics
 from rclpy.duration import Duration
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from std_srvs.srv import SetBool, Trigger
+from test_msgs.action import Fibonacci, NestedMessage
 
 from rosasync._ros import bridges, endpoints, graph
 from rosasync._ros.endpoints import gid_of, incompatibility, response_writers
@@ -179,6 +180,15 @@ class TestMissing:
                 lambda: f"among {own} services of other" in lonely.queries.explain_missing(missing)
             )
             assert "there are /far" in lonely.queries.explain_missing(lonely.service("/z", Trigger))
+
+    async def test_for_an_action_actions_are_counted(self, lonely: Opened) -> None:
+        name = "/entirely_different_things/_action/send_goal"
+        missing = lonely.service(name, NestedMessage.Impl.SendGoalService)
+        with borrowed_node() as other:
+            other.create_service(Fibonacci.Impl.SendGoalService, "/far/_action/send_goal", nothing)
+            await until(
+                lambda: "among 1 action of other" in lonely.queries.explain_missing(missing)
+            )
 
     @pytest.mark.parametrize(
         ("setting", "expected"),

@@ -196,8 +196,10 @@ class GraphQueries:
                 return f"no server has this name, and no other node is visible in {self._place()}"
         if similar := describe_similar(services, srv_name, srv_type):
             return f"no server has this name; there are {similar}"
+        meant = len(_services_meant(services, srv_name))
+        kind = "action" if srv_name.endswith(SEND_GOAL) else "service"
         return (
-            f"no server has this name or a similar one, among {count(len(services), 'service')} of "
+            f"no server has this name or a similar one, among {count(meant, kind)} of "
             "other nodes: start the server, or compare its name and namespace"
         )
 
@@ -307,15 +309,25 @@ def describe_similar(
         srv_name: the name.
         srv_type: the type that is meant, if it is known: services of this type are listed too.
     """
-    # An action is one of its services here; the others of it are not what is meant.
-    if srv_name.endswith(SEND_GOAL):
-        services = {name: types for name, types in services.items() if name.endswith(SEND_GOAL)}
-    elif "/_" not in srv_name:
-        services = {name: types for name, types in services.items() if "/_" not in name}
+    services = _services_meant(services, srv_name)
     similar = difflib.get_close_matches(srv_name, services, n=3, cutoff=0.7)
     same_type = sorted(name for name, types in services.items() if srv_type in types)
     names = dict.fromkeys([*similar, *same_type[:3]])
     return ", ".join(f"{name} ({', '.join(sorted(services[name]))})" for name in names)
+
+
+def _services_meant(
+    services: Mapping[str, Iterable[str]], srv_name: str
+) -> Mapping[str, Iterable[str]]:
+    """Return the services that a name without a server may mean: those of actions, or the others.
+
+    An action is one of its services here; the others of it are not what is meant.
+    """
+    if srv_name.endswith(SEND_GOAL):
+        return {name: types for name, types in services.items() if name.endswith(SEND_GOAL)}
+    if "/_" not in srv_name:
+        return {name: types for name, types in services.items() if "/_" not in name}
+    return services
 
 
 def _names_of(services: Iterable[Any]) -> list[str]:
