@@ -65,6 +65,14 @@ async def test_the_default(ros_graph):
     await enable(ros_graph)
 """
 
+MISSING = """
+from std_srvs.srv import SetBool
+
+async def test_missing(ros_graph):
+    async with ros_graph.session() as session:
+        await session.call(SetBool, "/arm", wait=False)
+"""
+
 PLAIN = """
 import pytest
 from std_srvs.srv import SetBool
@@ -127,6 +135,18 @@ def test_the_graph_is_in_the_loop_that_the_configuration_says(project: Path) -> 
     (project / "test_loops.py").write_text(code)
     output = run(project, "-o", "asyncio_default_test_loop_scope=module")
     assert "5 passed" in output, output
+
+
+@pytest.mark.parametrize("option", ["--tb=auto", "--full-trace"])
+def test_a_traceback_ends_in_the_test_if_rosasync_is_installed(project: Path, option: str) -> None:
+    (project / "test_arm.py").write_text(MISSING)
+    (project / "conftest.py").write_text(
+        "from rosasync.testing import plugin\nplugin.INSTALLED = True\n"
+    )
+    output = run(project, option)
+    assert 'await session.call(SetBool, "/arm", wait=False)' in output
+    assert "ServiceUnavailable: /arm: no server" in output
+    assert ("rosasync/_client" in output) is (option == "--full-trace")
 
 
 def test_a_plain_fixture_is_told_to_be_async(project: Path) -> None:

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import importlib.util
 import inspect
+import sys
 from collections.abc import AsyncIterator, Callable
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -25,6 +27,9 @@ REAL_SETTLE = 0.1
 
 LOOP_SCOPES = ("function", "class", "module", "package", "session")
 """How long a loop of pytest-asyncio may live."""
+
+INSTALLED = Path(__file__).parents[2].name in ("site-packages", "dist-packages")
+"""Whether rosasync is installed. In a clone of it, the tests are about its own frames."""
 
 KIND = pytest.StashKey[Any]()
 """Where the parameter of ``ros_graph`` is kept for the fixture that opens the graph."""
@@ -85,9 +90,20 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> None:
-    """Keep whether a test has failed, for the end of its graph."""
-    if call.when == "call" and call.excinfo is not None:
+    """Keep whether a test has failed, for the end of its graph, and shorten its traceback."""
+    if call.excinfo is None:
+        return
+    if call.when == "call":
         item.stash[ENDED_EARLY] = True
+    if INSTALLED:
+        _hide_library()
+
+
+def _hide_library() -> None:
+    """Let pytest leave the frames of rosasync out of its tracebacks, unless with --full-trace."""
+    for name, module in list(sys.modules.items()):
+        if name.partition(".")[0] == "rosasync":
+            vars(module)["__tracebackhide__"] = True
 
 
 @pytest.fixture(scope="session")
