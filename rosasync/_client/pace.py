@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import ClassVar
 
 __all__ = ["RECENT", "STALE", "Measured", "Pace"]
 
@@ -46,9 +45,6 @@ class Pace:
         longest: the longest response time for each number of places that were taken.
         until: the time at which the first of the response times is stale.
     """
-
-    LIMIT: ClassVar[float] = 2.0
-    """No estimate is longer than so many times the longest recent response time."""
 
     count: int
     mean: float

@@ -277,7 +277,10 @@ class Window:
 
         Most callers have far more time, and nothing has to be estimated for them.
         """
-        return seconds >= Pace.LIMIT * self._longest or seconds >= self.expected(now)
+        # No work is longer than its response time, and nothing is expected to take longer than one
+        # work for each request that is out, and one more: see `Pace.expected`.
+        limit = (self.taken + 2) * self._longest
+        return seconds >= limit or seconds >= self.expected(now)
 
     def expected(self, now: float) -> float:
         """Return the seconds to the answer of a request that is sent now, at most; 0 if unknown."""
