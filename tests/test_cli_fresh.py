@@ -5,13 +5,16 @@ from __future__ import annotations
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
 
+from rosasync._ros import discovery
 from rosasync._ros.fresh_ports import FOLDER, port_prefix
 from rosasync._ros.profile import (
     SWITCH,
@@ -23,7 +26,7 @@ from rosasync._ros.profile import (
 )
 from tests.support.command import json_lines, rosasync
 from tests.support.process import ROOT, ended, first_line
-from tests.support.times import LIMIT
+from tests.support.times import LIMIT, until
 
 pytestmark = pytest.mark.slow
 
@@ -41,9 +44,28 @@ sys.stdin.readline()
 """
 
 
+PARTICIPANT = """
+import os, socket, sys
+with socket.socket(type=socket.SOCK_DGRAM) as own:
+    own.bind(("", int(sys.argv[1])))
+    sys.stdin.readline()
+"""
+"""Has a socket where a participant would listen."""
+
+
 def offset_in(text: str) -> int:
     [found] = re.findall(r"<(?:\w+:)?offsetd3>(\d+)<", text)
     return int(found)
+
+
+def processes_with(argument: str) -> list[str]:
+    """Return the processes that have this in their command line."""
+    found = []
+    for file in Path("/proc").glob("[0-9]*/cmdline"):
+        with suppress(OSError):
+            if argument.encode() in file.read_bytes():
+                found.append(file.parent.name)
+    return found
 
 
 class TestRun:
@@ -82,6 +104,32 @@ class TestRun:
             assert process.stdout.readline() == b"ready\n"
             process.terminate()
             assert process.wait(LIMIT) == -signal.SIGTERM
+
+    @pytest.mark.parametrize("prefix", [(), ("sh", "-c", '"$@"; true', "sh")], ids=["it", "child"])
+    def test_participants_are_introduced(self, prefix: tuple[str, ...]) -> None:
+        """Others announce themselves again to those of the program and of its children."""
+        domain = int(os.environ["ROS_DOMAIN_ID"])
+        *_, port, other = discovery.ports_of(domain)
+        run = (sys.executable, "-m", "rosasync", "run", *prefix)
+        with socket.socket(type=socket.SOCK_DGRAM) as listener:
+            listener.bind((discovery.LOCALHOST, other))
+            listener.settimeout(LIMIT)
+            command = (*run, sys.executable, "-c", PARTICIPANT, str(port))
+            with subprocess.Popen(command, stdin=subprocess.PIPE, cwd=ROOT) as process:
+                address = port.to_bytes(4, "little") + bytes(12) + b"\x7f\x00\x00\x01"
+                for _ in range(2):
+                    while address not in listener.recv(1 << 16):
+                        pass
+                process.communicate(b"\n", timeout=LIMIT)
+
+    def test_the_program_gets_no_child(self) -> None:
+        program = "import os\ntry: os.wait()\nexcept ChildProcessError: print('none')"
+        assert rosasync("run", sys.executable, "-c", program).stdout == "none\n"
+
+    async def test_nothing_runs_after_the_program(self) -> None:
+        name = f"rosasync-test-{os.getpid()}"
+        assert rosasync("run", "sh", "-c", "exit 0", name).returncode == 0
+        await until(lambda: not processes_with(name))
 
     def test_options_belong_to_the_program(self) -> None:
         assert rosasync("run", "echo", "--help", "-x").stdout == "--help -x\n"

@@ -7,12 +7,14 @@ import os
 import signal
 import sys
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from rosasync._cli.errors import CliError, Code
+from rosasync._cli.introducer import introduce_program
 from rosasync._cli.output import note
 from rosasync._cli.run import fail
 from rosasync._ros.domain import environment_domain
@@ -43,6 +45,7 @@ def run_fresh(
 
     Gives it a Fast DDS profile in its environment: a port that no dead process has left behind,
     and what `rosasync profile` prints. If you have a profile, it gets a copy of that with the port.
+    For up to 30 s, a second process asks its peers to announce themselves to its nodes.
     The program replaces this process, so signals and the exit code are its own.
 
     \b
@@ -54,7 +57,10 @@ def run_fresh(
     try:
         if not switched_off() and "fastrtps" in environ.get("RMW_IMPLEMENTATION", "fastrtps"):
             variable = profile_variable(is_old())
-            environ[variable] = str(_write(fresh_profile(environment_domain(), is_old())))
+            domain = environment_domain()
+            with suppress(OSError):
+                introduce_program(domain)
+            environ[variable] = str(_write(fresh_profile(domain, is_old())))
     except RosasyncError as error:
         fail(error)
         raise typer.Exit(Code.USAGE) from None

@@ -19,8 +19,17 @@ import struct
 from collections.abc import Iterator
 from pathlib import Path
 
-__all__ = ["introduced", "introduction", "multicast_port", "own_ports", "ports_of", "udp_sockets"]
+__all__ = [
+    "introduce",
+    "introduced",
+    "introduction",
+    "multicast_port",
+    "own_ports",
+    "ports_of",
+    "udp_sockets",
+]
 
+SELF = "self"
 LEASE = 1
 """Seconds until the other participants forget the one that is introduced."""
 PARTICIPANTS = 32
@@ -49,16 +58,27 @@ def introduced(domain: int) -> Iterator[None]:
     before = own_ports(domain)
     yield
     for port in own_ports(domain) - before:
-        _introduce_on_host(domain, port)
-        if multicast_port(domain) in _own_udp_ports():
-            for index, name in socket.if_nameindex():
-                if name != LOOPBACK:
-                    _introduce_on_network(domain, port, index)
+        introduce(domain, port)
 
 
-def own_ports(domain: int) -> set[int]:
-    """Return the ports on which this process's participants of the domain listen."""
-    return _own_udp_ports() & {*ports_of(domain)}
+def introduce(domain: int, port: int, process: int | str = SELF) -> None:
+    """Let the other participants announce themselves to the one that listens at a port.
+
+    Args:
+        domain: the ROS domain.
+        port: the port on which the participant listens for announcements.
+        process: the id of its process, if it is not this one.
+    """
+    _introduce_on_host(domain, port)
+    if multicast_port(domain) in _udp_ports_of(process):
+        for index, name in socket.if_nameindex():
+            if name != LOOPBACK:
+                _introduce_on_network(domain, port, index)
+
+
+def own_ports(domain: int, process: int | str = SELF) -> set[int]:
+    """Return the ports on which a process's participants of the domain listen."""
+    return _udp_ports_of(process) & {*ports_of(domain)}
 
 
 def multicast_port(domain: int) -> int:
@@ -120,9 +140,11 @@ def udp_sockets() -> Iterator[tuple[int, str]]:
             yield int(fields[1].rpartition(":")[2], 16), fields[9]
 
 
-def _own_udp_ports() -> set[int]:
+def _udp_ports_of(process: int | str) -> set[int]:
+    """Return the ports of a process's UDP sockets, as far as this user may see them."""
     names = set()
-    for descriptor in Path("/proc/self/fd").glob("*"):
-        with contextlib.suppress(OSError):
-            names.add(os.readlink(descriptor))
+    with contextlib.suppress(OSError):
+        for descriptor in Path(f"/proc/{process}/fd").iterdir():
+            with contextlib.suppress(OSError):
+                names.add(os.readlink(descriptor))
     return {port for port, inode in udp_sockets() if f"socket:[{inode}]" in names}
