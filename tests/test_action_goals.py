@@ -9,7 +9,7 @@ from collections.abc import AsyncIterator
 import pytest
 from test_msgs.action import Fibonacci
 
-from rosasync import GoalStatus, ServerGone, Session
+from rosasync import GoalStatus, ServerGone, ServiceUnavailable, Session
 from rosasync._actions.active_goal import ActiveGoal
 from rosasync._actions.active_goals import LINGER, TICK, ActiveGoals
 from rosasync._actions.cancellation import END_TIMEOUT, CancelAnswer, Step, next_step
@@ -255,6 +255,24 @@ async def detach(session: Session) -> None:
     async with session.goal(Fibonacci, "/fibonacci") as goal:
         goal.detach()
         await goal.result()
+
+
+async def test_a_server_vanishes_while_an_attached_goal_waits_for_its_topics(
+    fake_graph: FakeGraph, virtual_clock: VirtualClock, server: ScriptedAction
+) -> None:
+    server.vanish()
+    async with fake_graph.session() as session:
+        pursuit = session.attach(Fibonacci, "/fibonacci", uuid.uuid4())
+        task = asyncio.create_task(pursuit.__aenter__())
+        await virtual_clock.advance(0.1)
+        server.come_back(topics=False)
+        await virtual_clock.advance(0.1)
+        server.vanish()
+        await virtual_clock.advance(2.0)
+        assert not task.done()
+        with pytest.raises(ServiceUnavailable):
+            await virtual_clock.skip(task)
+        assert session.core.actions.out == 0
 
 
 async def test_a_new_server_that_the_graph_does_not_report(virtual_clock: VirtualClock) -> None:

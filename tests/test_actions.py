@@ -22,7 +22,9 @@ from rosasync import (
     Session,
     SessionClosed,
 )
+from rosasync._actions import server_watch
 from tests.support.action_servers import ActionServerProcess
+from tests.support.nodes import borrowed_node
 from tests.support.times import LIMIT, TICK, until
 
 if TYPE_CHECKING:
@@ -243,6 +245,26 @@ async def test_an_ended_goal_still_has_its_result(
         await goal.result()
     async with session.attach(Fibonacci, "/fibonacci", goal.id) as attached:
         assert list((await attached.result()).sequence) == [0, 1]
+
+
+async def test_attaching_to_a_server_that_vanishes_before_it_is_matched(
+    session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It has no feedback topic, so that its services are there and it is not matched yet."""
+    monkeypatch.setattr(server_watch, "MATCH_TIMEOUT", LIMIT)
+    services = {
+        "/half/_action/send_goal": Fibonacci.Impl.SendGoalService,
+        "/half/_action/cancel_goal": Fibonacci.Impl.CancelGoalService,
+        "/half/_action/get_result": Fibonacci.Impl.GetResultService,
+    }
+    attached = session.attach(Fibonacci, "/half", uuid4(), accept_timeout=40 * TICK)
+    task = asyncio.create_task(attached.__aenter__())
+    with borrowed_node() as node:
+        for name, service in services.items():
+            node.create_service(service, name, print)
+        await until(lambda: all(session.service_is_ready(s, n) for n, s in services.items()))
+    with pytest.raises(ServiceUnavailable):
+        await task
 
 
 async def test_there_is_no_server(session: Session) -> None:

@@ -146,12 +146,11 @@ class ActionClient:
         deadline = None if timeout is None else goal.started + timeout
         try:
             self._add(goal)
-            await self._watch.reach(goal, deadline, wait)
+            goal.servers = await self._watch.find(goal, deadline, wait)
             self._owner.check_open()
         except BaseException as error:
             self._remove(goal)
             raise self.errors.translate(goal, error, "no server was found") from None
-        goal.servers = self._watch.servers()
         self._ask(goal)
 
     def timed_out(self, goal: ActiveGoal, seconds: float) -> CallError:

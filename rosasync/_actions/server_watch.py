@@ -21,6 +21,9 @@ MATCH_TIMEOUT = 1.0
 POLL_MIN = 0.002
 """Seconds until the first look for these matches. The intervals grow."""
 
+GRAPH_DELAY = 0.05
+"""Seconds until the next look at a graph that has no server, although one is matched."""
+
 
 class Matched(Protocol):
     """Something that is of use once it is matched with a server."""
@@ -128,6 +131,20 @@ class ServerWatch:
         while not self._match() and self._loop.time() < limit:
             await asyncio.sleep(delay)
             delay *= 1.5
+
+    async def find(self, goal: ActiveGoal, deadline: float | None, wait: bool | float) -> Servers:
+        """As `reach`, and return the servers, of which there is one at least.
+
+        The one that was reached may have vanished since, and the next is waited for.
+        """
+        while True:
+            await self.reach(goal, deadline, wait)
+            if servers := self.servers_now():
+                return servers
+            if deadline is not None and self._loop.time() >= deadline:
+                raise self._errors.unavailable(goal)
+            # Still matched, as the client sees it: it learns of the end apart from the graph.
+            await asyncio.sleep(GRAPH_DELAY)
 
     def _match(self) -> bool:
         if not self._matched:

@@ -84,9 +84,12 @@ class ScriptedAction:
             publisher.close()
         self.sends.clear()
 
-    def come_back(self) -> None:
+    def come_back(self, topics: bool = True) -> None:
         """Be there again, with the goals it still has. For the graph it is another server."""
         self._open()
+        if not topics:
+            self._feedback.close()
+            self._status.close()
 
     def close(self) -> None:
         self.vanish()
