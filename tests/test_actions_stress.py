@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import random
+import subprocess
+import sys
 from collections.abc import Callable, Iterable
 from contextlib import AsyncExitStack, suppress
 from typing import TYPE_CHECKING, Any
@@ -23,6 +25,7 @@ from rosasync import (
 )
 from rosasync._actions import result_plan
 from tests.support.action_servers import ActionServerProcess
+from tests.support.process import ROOT, own
 from tests.support.times import LIMIT, TICK, until
 
 pytestmark = pytest.mark.slow
@@ -315,3 +318,16 @@ async def shown(
             return
         await asyncio.sleep(LIMIT / 100)
     raise AssertionError(statuses)
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(15 * 60)
+@pytest.mark.parametrize("sides", ["client", "both"])
+def test_ten_thousand_goals_leave_no_memory_behind(
+    action_server: ActionServerProcess, bridge: Bridge, sides: str
+) -> None:
+    if sides == "client":
+        action_server.serve_now("/quick", result_timeout=5)
+    program = [sys.executable, "-m", "tests.support.goal_memory", bridge, sides]
+    output = subprocess.run(program, cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    assert float(own(output)) < 1.0
