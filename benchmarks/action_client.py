@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import asyncio
 import resource
+import statistics
 import sys
 import threading
 import time
+from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import Any
 
-from benchmarks.action_server import NAME
+from benchmarks.action_server import CALL, HELD, NAME
 from tests.support.child import serve_commands
 
 __all__ = ["Ours", "Stock"]
@@ -75,6 +77,31 @@ class Ours:
             for _ in range(at_once):
                 group.create_task(worker())
         return received
+
+    def beside(self, goals: int, calls: int) -> float:
+        """Return the time of a call beside goals that run, as a multiple of its time alone."""
+        return self._loop.run_until_complete(self._beside(goals, calls))
+
+    async def _beside(self, goals: int, calls: int) -> float:
+        from std_srvs.srv import Trigger
+        from test_msgs.action import Fibonacci
+
+        async def call_seconds() -> list[float]:
+            times = []
+            for _ in range(calls):
+                begin = time.perf_counter()
+                await self._session.call(Trigger, CALL)
+                times.append(time.perf_counter() - begin)
+            return times
+
+        alone = await call_seconds()
+        async with AsyncExitStack() as stack:
+            # Held goals end as cancelled when they are left.
+            for _ in range(goals):
+                goal = self._session.goal(Fibonacci, NAME, {"order": HELD}, cancel_timeout=0.0)
+                await stack.enter_async_context(goal)
+            beside = await call_seconds()
+        return statistics.median(beside) / statistics.median(alone)
 
     def close(self) -> None:
         self._loop.run_until_complete(self._session.aclose())
@@ -161,7 +188,10 @@ def main() -> None:
         seconds = time.perf_counter() - begin
         return {"seconds": seconds, "cpu": cpu_seconds() - cpu, "received": received}
 
-    serve_commands({"goals": goals, "memory": resident})
+    commands: dict[str, Any] = {"goals": goals, "memory": resident}
+    if isinstance(client, Ours):
+        commands["beside"] = client.beside
+    serve_commands(commands)
     client.close()
 
 

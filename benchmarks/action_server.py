@@ -1,7 +1,8 @@
 """An action server in a process of its own: ``python -m benchmarks.action_server KIND``.
 
 KIND is ``rosasync`` or ``stock``. A goal of order 0 ends at once. Others publish feedback: the
-order is how many messages, plus `SLOWLY` for a hundred a second instead of a thousand.
+order is how many messages, plus `SLOWLY` for a hundred a second instead of a thousand. A goal of
+the order `HELD` runs until it is cancelled, with rosasync's server, which serves `CALL` as well.
 """
 
 from __future__ import annotations
@@ -14,10 +15,12 @@ from typing import Any
 
 from tests.support.child import serve_commands
 
-__all__ = ["NAME", "SLOWLY"]
+__all__ = ["CALL", "HELD", "NAME", "SLOWLY"]
 
 NAME = "/bench/action"
+CALL = "/bench/action_call"
 SLOWLY = 1_000_000
+HELD = -1
 
 
 def plan(order: int) -> tuple[int, float]:
@@ -61,11 +64,14 @@ def serve_stock() -> None:
 
 
 async def serve_ours() -> None:
+    from std_srvs.srv import Trigger
     from test_msgs.action import Fibonacci
 
     import rosasync
 
     async def execute(goal: Any) -> Any:
+        if goal.request.order == HELD:
+            await asyncio.Event().wait()
         count, pause = plan(goal.request.order)
         begin = time.monotonic()
         for number in range(count):
@@ -74,7 +80,8 @@ async def serve_ours() -> None:
         return Fibonacci.Result()
 
     async with rosasync.Session("bench_action_server") as session:
-        session.serve_action(Fibonacci, NAME, execute, concurrency=100, result_timeout=10.0)
+        session.serve_action(Fibonacci, NAME, execute, concurrency=2000, result_timeout=10.0)
+        session.serve(Trigger, CALL, lambda request, response: response)
         await asyncio.to_thread(serve_commands, {})
 
 

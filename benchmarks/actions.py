@@ -24,7 +24,8 @@ OTHERS = 20
 ONE, TEN, FIFTY = "goal to result, ms", "10 at once, goals/s", "50 at once, goals/s"
 FEEDBACK, BESIDE = "feedback at 1 kHz, CPU %", f"beside {OTHERS} others' feedback, CPU %"
 GROWTH = "memory from 1,000 to 10,000 goals, MB"
-WHAT = (ONE, TEN, FIFTY, FEEDBACK, BESIDE, GROWTH)
+CALLS = "a call beside 1,000 goals / alone"
+WHAT = (ONE, TEN, FIFTY, FEEDBACK, BESIDE, GROWTH, CALLS)
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,9 @@ class Figure:
 
 def total(rounds: int) -> int:
     """Return how many figures `measure` finds."""
-    return len(CLIENTS) * len(SERVERS) * rounds * (len(WHAT) - 1) + len(SERVERS)
+    # Once, of our client alone: the growth with each server, and the calls with ours.
+    once = len(SERVERS) + 1
+    return len(CLIENTS) * len(SERVERS) * rounds * (len(WHAT) - 2) + once
 
 
 def measure(
@@ -70,16 +73,14 @@ def measure(
                     _child("action_client", client) as child,
                 ):
                     peer.ask_now("ready")
-                    grows = client == OURS and number == rounds - 1
-                    for figure in _round(child, client, server, scale, grows):
+                    last = client == OURS and number == rounds - 1
+                    for figure in _round(child, client, server, scale, last):
                         found.append(figure)
                         on_figure(figure)
     return found
 
 
-def _round(
-    child: Child, client: str, server: str, scale: float, with_growth: bool
-) -> Iterator[Figure]:
+def _round(child: Child, client: str, server: str, scale: float, last: bool) -> Iterator[Figure]:
     def ask(count: int, at_once: int, order: int = 0) -> dict[str, float]:
         count = max(at_once, round(count * scale))
         answer = child.ask_now("goals", patience=TIMEOUT, count=count, at_once=at_once, order=order)
@@ -115,14 +116,21 @@ def _round(
         grown: float = (child.ask_now("memory") - before) / 1e6
         return grown
 
+    def calls() -> float:
+        count = round(1000 * scale)
+        ratio: float = child.ask_now("beside", patience=TIMEOUT, goals=count, calls=count)
+        return ratio
+
     work: dict[str, Callable[[], float | tuple[float, int]]] = {
         ONE: one,
         TEN: lambda: several(10),
         FEEDBACK: feedback,
         BESIDE: beside,
     }
-    if with_growth:
+    if last:
         work[GROWTH] = growth
+    if last and server == OURS:
+        work[CALLS] = calls
     # Last, because rclpy's client may lose goals then, and can measure nothing more.
     work[FIFTY] = lambda: several(50)
     ask(50, 10)
@@ -164,6 +172,7 @@ def goals(figures: Sequence[Figure]) -> list[Goal]:
     for server in SERVERS:
         growth = _median(figures, GROWTH, OURS, server)
         found.append(check(f"{GROWTH}, with the server of {server}", growth, "<=", 1.0))
+    found.append(check(CALLS, _median(figures, CALLS, OURS, OURS), "<=", 1.1))
     return found
 
 
@@ -175,9 +184,10 @@ def section(trials: Trials) -> str:
         for server in SERVERS:
             ours, stock = (_median(figures, what, client, server) for client in CLIENTS)
             ratio = f"{ours / stock:.2g}" if ours and stock else "-"
-            # The growth is measured for rosasync's client alone.
-            theirs = "-" if what == GROWTH else _text(stock)
-            table.append([what, server, _text(ours), theirs, ratio])
+            # These two are measured for rosasync's client alone, and one with its server alone.
+            theirs = "-" if what in (GROWTH, CALLS) else _text(stock)
+            if what != CALLS or ours is not None:
+                table.append([what, server, _text(ours), theirs, ratio])
     return "\n".join(
         (
             "## Actions\n",
