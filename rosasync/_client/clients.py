@@ -48,6 +48,10 @@ class Clients:
         counts: the counters of the service.
         owner: the service. No client is evicted while it has callers that wait.
         listener: the reports of servers that take part.
+
+    Attributes:
+        share: the share of the server's queue, in places.
+        others: the number of clients of the service in other sessions.
     """
 
     def __init__(
@@ -62,6 +66,7 @@ class Clients:
         listener: Listener,
     ) -> None:
         self.share = 0
+        self.others = 0
         self.matching = Matching(service, node.queries, watch, self)
         self._service = service
         self._node = node
@@ -212,6 +217,7 @@ class Clients:
         self.matching.count_servers()
         clients = self._node.queries.count_clients(self._service)
         self.share = self._limits.share(clients)
+        self.others = max(0, clients - len(self._clients))
         for client in self._clients:
             client.resize(self._limits.window(clients))
 

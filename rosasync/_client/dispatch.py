@@ -9,6 +9,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol
 
 from rosasync._client.clients import Clients
+from rosasync._client.probes import Probes
 from rosasync._core.ports import PortDestroyed
 from rosasync.errors import ContextShutdown
 
@@ -134,6 +135,7 @@ class Dispatch:
         self._loop = asyncio.get_running_loop()
         self._scheduled = False
         self._ended = False
+        self._probes = Probes(self.clients, self.schedule)
 
     @property
     def awaits_match(self) -> bool:
@@ -267,6 +269,7 @@ class Dispatch:
     def end(self, ending: Callable[[], Exception]) -> None:
         """Fail every waiting caller, and assign nothing any more."""
         self._ended = True
+        self._probes.close()
         self._fail_waiting(ending)
 
     # The decision.
@@ -282,6 +285,7 @@ class Dispatch:
         if self._ended:
             return
         now = self._loop.time()
+        self._probes.update(now, overloaded=now < self.overloaded_until)
         self._wake_match_waiters()
         for call in tuple(self.resends):
             overloaded = call.repeats and self._is_short(call, now)
@@ -327,13 +331,16 @@ class Dispatch:
             self.overloaded_until = now + max(OVERLOAD, PERSISTENCE * needed)
             self._latest = max(self._latest, waiter.deadline) if self.passed else waiter.deadline
             self.passed[waiter] = None
-        if not self.passed or not self.clients.nothing_out:
+        if not self.passed or not self.clients.nothing_out or not self._probes.may_send(now):
             return None
         # Nothing else is out, so one that has hardly time enough finds out how quick the server is.
         # Nothing of any client, or with many clients of one place each, all of them would find out.
         waiter = max(self.passed, key=_deadline_of)
         del self.passed[waiter]
-        return None if waiter.gone else waiter
+        if waiter.gone:
+            return None
+        self._probes.send(now, _deadline_of(waiter) - now)
+        return waiter
 
     def _is_short(self, call: Call, now: float) -> bool:
         """Return whether sending a call again would cost others their answers, or come too late."""

@@ -54,6 +54,7 @@ class Window:
             without a place whose late responses are expected. Written by `Client.send` as well.
         abandoned: those of them that are abandoned and take a place.
         answered: the highest number that was answered.
+        answered_at: the time of the last answer.
         last: the highest number that was sent. Written by `Client.send`.
         servers: the servers that the graph showed last.
         times: the response times, and the patience.
@@ -63,7 +64,6 @@ class Window:
 
     __slots__ = (
         "_grace",
-        "_last_answer",
         "_leaving",
         "_longest",
         "_outdated",
@@ -72,6 +72,7 @@ class Window:
         "_recent",
         "abandoned",
         "answered",
+        "answered_at",
         "last",
         "leases",
         "sent",
@@ -98,7 +99,7 @@ class Window:
         self._longest = 0.0
         # What they say, until the next answer: one batch of answers lets many callers go.
         self._pace: Pace | None = None
-        self._last_answer = 0.0
+        self.answered_at = 0.0
         # The requests without a caller, each with the time until which it is remembered. Requests
         # that have been answered in the meantime are dropped when they come to the front.
         self._leaving: deque[tuple[float, Sent]] = deque()
@@ -215,8 +216,8 @@ class Window:
         if seconds > self._longest:
             self._longest = seconds
         # Both without a call, because every answer comes here.
-        work = seconds if sent.at > self._last_answer else now - self._last_answer
-        self._last_answer = now
+        work = seconds if sent.at > self.answered_at else now - self.answered_at
+        self.answered_at = now
         self._recent.append((now, seconds, sent.out, work))
         self._pace = None
         if number <= TIMED or not number % TIMED:

@@ -11,6 +11,7 @@ import pytest
 
 from rosasync import Limits, Retry
 from rosasync._client.dispatch import Dispatch
+from rosasync._client.probes import next_pause
 from rosasync._client.retry import PER_SECOND
 from tests.support.fake_graph import FakeGraph
 from tests.support.overload import Case, Outcome, StockCaller, VirtualLoop, offer, simulate
@@ -60,6 +61,34 @@ def test_with_a_client_for_each_call_the_server_works_for_callers_that_still_wai
     result = simulate(case, limits=Limits(clients=8, in_flight=1))
     assert result.goodput >= 0.8
     assert result.late <= 0.2
+
+
+@pytest.mark.parametrize(
+    ("case", "goodput"),
+    [
+        # Without pauses between the probes: 0.78, 0.46, 0.83 and 0.39.
+        (Case(work=0.1, timeouts=(0.5,), load=4, processes=4), 0.88),
+        (Case(work=0.1, timeouts=(0.5,), load=1.5, processes=4), 0.6),
+        (Case(work=0.1, timeouts=(1.0,), load=4, processes=8), 0.9),
+        (Case(work=0.1, timeouts=(1.0,), load=1.5, processes=8), 0.65),
+    ],
+)
+def test_several_clients_that_ask_how_quick_the_server_is_do_not_fill_its_queue(
+    case: Case, goodput: float
+) -> None:
+    assert simulate(case).goodput >= goodput
+
+
+def test_a_client_pauses_after_a_probe_that_took_too_long() -> None:
+    assert next_pause(0.0, took=0.6, left=0.5, others=3) == pytest.approx(0.2)
+    # Longer after the next one, up to half of the time that its caller had.
+    assert next_pause(0.2, took=0.44, left=0.5, others=3) == pytest.approx(0.24)
+    assert next_pause(0.24, took=0.8, left=0.5, others=3) == pytest.approx(0.25)
+    # Shorter after a quick one, also because the others cannot have much out.
+    assert next_pause(0.25, took=0.35, left=0.5, others=3) == pytest.approx(0.2)
+    assert next_pause(0.25, took=0.01, left=0.5, others=3) == 0.0
+    # A client that is alone waits only for its own requests.
+    assert next_pause(0.0, took=5.0, left=0.5, others=0) == 0.0
 
 
 @pytest.mark.parametrize("failing", ["requests", "responses"])

@@ -511,7 +511,10 @@ class TestExpected:
             scale = 10 ** choose.uniform(-3, 1)
             at_once = choose.randint(1, 10)
             self.serve(bench, [choose.expovariate(1 / scale) for _ in range(30)], at_once)
+            bench.window.clear()
             for _ in range(30):
+                if bench.window.free and choose.random() < 0.3:
+                    bench.send()
                 bench.now += choose.choice([0.0, 0.0, scale, STALE])
                 needed = bench.expected()
                 for seconds in (0.0, 0.5 * needed, 0.99 * needed, 1.01 * needed, 3.0 * needed):
