@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import math
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from rosasync._client.clients import Clients
+from rosasync._client.order import Order
 from rosasync._client.probes import Probes
 from rosasync._core.ports import PortDestroyed
 from rosasync.errors import ContextShutdown
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from rosasync._client.client import Client
     from rosasync._client.counts import Counts
     from rosasync._client.graph_watch import GraphWatch
+    from rosasync._client.order import Waiter
     from rosasync._client.sent import Sent
     from rosasync._core.aio import Deadlines
     from rosasync._core.ports import NodePort, Service
@@ -26,36 +27,7 @@ if TYPE_CHECKING:
     from rosasync.options import Limits
     from rosasync.tracing import ClientTracing
 
-__all__ = ["Dispatch", "LeaseWaiter", "Waiter"]
-
-
-OVERLOAD = 1.0
-"""Minimum number of seconds for which a service counts as overloaded, after a caller was passed
-over. Callers whose deadlines pass together come back together, and would fill the window again."""
-PERSISTENCE = 4
-"""The same as a number of response times, for a slow server."""
-
-
-class Waiter(Protocol):
-    """A caller in the queue: a `Call` or a `LeaseWaiter`.
-
-    Attributes:
-        future: done when the caller has left.
-        deadline: the loop time by which the caller needs its answer; None if that is not known.
-        passed: the seconds until the server answers, and the seconds that were left, when the
-            caller was passed over.
-    """
-
-    future: asyncio.Future[Any]
-    deadline: float | None
-    passed: tuple[float, float] | None
-
-    @property
-    def gone(self) -> bool:
-        """Whether nothing may be sent for the caller any more."""
-
-    def start(self, client: Client, now: float) -> None:
-        """Go on with this client, which has a free place."""
+__all__ = ["Dispatch", "LeaseWaiter"]
 
 
 class LeaseWaiter:
@@ -87,18 +59,16 @@ class Dispatch:
 
     It runs when something was added or came free, and from nowhere else: in the next turn of the
     loop after a caller or a request to be sent again was added, or a place came free (`schedule`);
-    and when the graph may have changed, because a client may be matched now.
+    and when the graph may have changed, because a client may be matched now. While callers wait,
+    that is looked at every half second, so those passed over need no timer of their own.
 
     In the next turn, and not at once: by then the callers that were cancelled in this turn are
     done, and no caller is resumed in the middle of another one's work.
 
     Attributes:
         clients: the clients of the service.
-        queue: the callers that wait for a place, in their order.
-        passed: the callers that were passed over, in their order: they would be answered too late,
-            unless the server becomes quicker.
-        overloaded_until: the loop time until which the service counts as overloaded, because a
-            caller was passed over. Until then no call is sent without a look at its deadline.
+        order: the callers that wait for a place, and who of them goes next.
+        queue: see `Order`, as for ``passed``.
         resends: the calls that wait to be sent again, in the order in which that became due.
         leased: the calls that wait for their leased client: for its match, or for the place of the
             lease while an abandoned request takes it.
@@ -117,11 +87,11 @@ class Dispatch:
         listener: Listener,
     ) -> None:
         self.clients = Clients(service, node, limits, watch, errors, counts, self, listener)
-        self.queue: dict[Waiter, None] = {}
-        self.passed: dict[Waiter, None] = {}
-        self.overloaded_until = 0.0
-        # The latest deadline of those passed over since there were none.
-        self._latest = 0.0
+        self._probes = Probes(self.clients, self.schedule)
+        self.order = Order(self.clients, self._probes)
+        # Those of the order, because every call looks at them.
+        self.queue = self.order.queue
+        self.passed = self.order.passed
         self.resends: dict[Call, None] = {}
         self.leased: dict[Call, None] = {}
         # Each caller that waits for a match, with the client to be matched: None for any client.
@@ -135,7 +105,6 @@ class Dispatch:
         self._loop = asyncio.get_running_loop()
         self._scheduled = False
         self._ended = False
-        self._probes = Probes(self.clients, self.schedule)
 
     @property
     def awaits_match(self) -> bool:
@@ -153,7 +122,7 @@ class Dispatch:
     def idle(self) -> bool:
         """Whether no caller waits for a place, so that the next one may be sent at once."""
         busy = self.queue or self.passed or self.resends
-        return not busy and self._loop.time() >= self.overloaded_until
+        return not busy and self._loop.time() >= self.order.overloaded_until
 
     @property
     def waiting(self) -> int:
@@ -172,8 +141,12 @@ class Dispatch:
 
     # What is added, and what comes free.
 
-    def enqueue(self, waiter: Waiter) -> None:
+    def enqueue(self, waiter: Waiter, since: float) -> None:
         """Add a caller to the end of the queue.
+
+        Args:
+            waiter: the caller.
+            since: see `Order.queue`.
 
         Raises:
             PoolFull: the queue is full.
@@ -185,7 +158,7 @@ class Dispatch:
         free = self.clients.free
         if waiting >= self._limits.waiting + free:
             raise self._errors.pool_full(waiting, self._limits.waiting)
-        self.queue[waiter] = None
+        self.queue[waiter] = since
         if free:
             self.schedule()
         elif not waiting:
@@ -228,6 +201,18 @@ class Dispatch:
         self.passed.pop(call, None)
         self.resends.pop(call, None)
         self.leased.pop(call, None)
+
+    def on_left(self, call: Call, since: float) -> None:
+        """Record that the caller of a call that had to wait was cancelled.
+
+        Args:
+            call: the call.
+            since: the loop time since which the caller has waited.
+        """
+        now = self._loop.time()
+        known = call.deadline is not None and now >= call.deadline
+        if not known and (call.started or not self.clients.lacks_server):
+            self.order.patience.add(now - since, now)
 
     async def wait_for_match(self, client: Client | None, deadline: float | None) -> None:
         """Wait until a client is matched: any client if it is None.
@@ -285,7 +270,7 @@ class Dispatch:
         if self._ended:
             return
         now = self._loop.time()
-        self._probes.update(now, overloaded=now < self.overloaded_until)
+        self._probes.update(now, overloaded=now < self.order.overloaded_until)
         self._wake_match_waiters()
         for call in tuple(self.resends):
             overloaded = call.repeats and self._is_short(call, now)
@@ -297,7 +282,7 @@ class Dispatch:
             self._assign_lease(call, now)
         while self.queue or self.passed:
             client = self.clients.choose()
-            waiter = None if client is None else self._next_waiter(client, now)
+            waiter = None if client is None else self.order.next(client.window, now)
             if client is None or waiter is None:
                 break
             waiter.start(client, now)
@@ -305,46 +290,9 @@ class Dispatch:
         if self.callers_wait():
             self.clients.set_timers()
 
-    def _next_waiter(self, client: Client, now: float) -> Waiter | None:
-        """Take the first caller who can be answered in time, and pass over those before.
-
-        A call that is passed over is not ended: it costs nothing, and the server may become quick
-        again before its deadline.
-        """
-        window = client.window
-        if self.passed and window.answers_in(self._latest - now, now):
-            needed = window.expected(now)
-            for waiter in tuple(self.passed):
-                if waiter.gone or waiter.deadline is None or waiter.deadline - now >= needed:
-                    del self.passed[waiter]
-                    if not waiter.gone:
-                        return waiter
-        while self.queue:
-            waiter = next(iter(self.queue))
-            del self.queue[waiter]
-            if waiter.gone:
-                continue
-            if waiter.deadline is None or window.answers_in(waiter.deadline - now, now):
-                return waiter
-            needed = window.expected(now)
-            waiter.passed = (needed, waiter.deadline - now)
-            self.overloaded_until = now + max(OVERLOAD, PERSISTENCE * needed)
-            self._latest = max(self._latest, waiter.deadline) if self.passed else waiter.deadline
-            self.passed[waiter] = None
-        if not self.passed or not self.clients.nothing_out or not self._probes.may_send(now):
-            return None
-        # Nothing else is out, so one that has hardly time enough finds out how quick the server is.
-        # Nothing of any client, or with many clients of one place each, all of them would find out.
-        waiter = max(self.passed, key=_deadline_of)
-        del self.passed[waiter]
-        if waiter.gone:
-            return None
-        self._probes.send(now, _deadline_of(waiter) - now)
-        return waiter
-
     def _is_short(self, call: Call, now: float) -> bool:
         """Return whether sending a call again would cost others their answers, or come too late."""
-        if now < self.overloaded_until:
+        if now < self.order.overloaded_until:
             return True
         return call.deadline is not None and (
             not call.client.window.answers_in(call.deadline - now, now)
@@ -409,8 +357,3 @@ class Dispatch:
         for future in (*waiting, *self._match_waiters):
             if not future.done():
                 future.set_exception(error())
-
-
-def _deadline_of(waiter: Waiter) -> float:
-    """Return the deadline of a caller that was passed over."""
-    return -math.inf if waiter.gone or waiter.deadline is None else waiter.deadline

@@ -163,7 +163,7 @@ class ServicePool:
         call = Call(
             dispatch, loop.create_future(), request, plan, lease, trace, is_cancelled, deadline
         )
-        entry = server_timer = None
+        entry = server_timer = queued = None
         try:
             if timeout is not None and timeout <= 0:
                 self.check_open()
@@ -178,7 +178,7 @@ class ServicePool:
                     dispatch.queue
                     or dispatch.passed
                     or dispatch.resends
-                    or started < dispatch.overloaded_until
+                    or started < dispatch.order.overloaded_until
                 ):
                     client = self._clients.choose()
                 if copy and (client is None or retry is not None):
@@ -194,11 +194,14 @@ class ServicePool:
                         else:
                             server_timer = loop.call_at(started + wait, self._give_up_server, call)
                     self.check_open()
-                    dispatch.enqueue(call)
+                    queued = started if wait is True else loop.time()
+                    dispatch.enqueue(call, queued)
             if deadline is not None:
                 entry = self._deadlines.set(call.future, deadline)
             response = await call.future
         except BaseException as error:
+            if queued is not None and isinstance(error, asyncio.CancelledError):
+                dispatch.on_left(call, queued)
             raise self._count_failure(call, error, started) from None
         finally:
             # Not a method of `Deadlines`, because every call comes here.
@@ -259,7 +262,7 @@ class ServicePool:
         waiter = LeaseWaiter(self._loop.create_future())
         granted = False
         try:
-            dispatch.enqueue(waiter)
+            dispatch.enqueue(waiter, math.inf)
             await self._deadlines.wait(
                 waiter.future, None if timeout is None else started + timeout
             )

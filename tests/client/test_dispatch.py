@@ -12,6 +12,7 @@ import pytest
 
 from rosasync import Limits, QueueTimeout, ResponseTimeout, Retry, Session
 from rosasync._client.client import Client
+from rosasync._client.dispatch import Dispatch
 from tests.support.fake_graph import FakeGraph
 from tests.support.overload import Outcome, SerialServer, VirtualLoop, keep_calling, offer
 from tests.support.plain import Echo
@@ -203,5 +204,109 @@ def test_in_an_overload_nothing_is_sent_again() -> None:
         before = session.pool.statistics().retried
         await load
         assert session.pool.statistics().retried - before <= 5
+
+    play(scenario)
+
+
+# Callers that leave without notice.
+
+
+async def keep_leaving(session: Session, rate: float, seconds: float, patience: float) -> int:
+    """Have callers come that give up when they have waited so long; return how many did not."""
+    answered = 0
+
+    async def call() -> None:
+        nonlocal answered
+        try:
+            async with asyncio.timeout(patience):
+                await session.call(Echo, "/echo", timeout=None)
+        except TimeoutError:
+            return
+        answered += 1
+
+    async with asyncio.TaskGroup() as callers:
+        for _ in range(round(rate * seconds)):
+            callers.create_task(call())
+            await asyncio.sleep(1 / rate)
+    return answered
+
+
+def test_a_patient_caller_is_served_while_others_leave() -> None:
+    async def scenario(session: Session, server: SerialServer) -> None:
+        load = asyncio.create_task(keep_leaving(session, 400, 6.0, patience=0.5))
+        await asyncio.sleep(2.0)
+        patient = [session.start(Echo, "/echo", timeout=None) for _ in range(20)]
+        # Each eighth turn, as soon as they have waited for longer than the others.
+        await asyncio.wait_for(asyncio.gather(*patient), 0.6 + 20 * 8 * WORK)
+        # The rest was for those that leave.
+        assert await load >= 0.85 * (6.0 / WORK) - 20
+
+    play(scenario)
+
+
+def test_patient_callers_are_served_in_their_order_while_others_leave() -> None:
+    answered: list[int] = []
+
+    async def scenario(session: Session, server: SerialServer) -> None:
+        async def caller(number: int) -> None:
+            await session.call(Echo, "/echo", Echo.Request(number), timeout=None)
+            answered.append(number)
+
+        load = asyncio.create_task(keep_leaving(session, 400, 4.0, patience=0.2))
+        await asyncio.sleep(LEARN)
+        await asyncio.gather(*(caller(number) for number in range(40)))
+        assert answered == sorted(answered)
+        await load
+
+    play(scenario)
+
+
+def test_callers_cancelled_together_do_not_change_the_order() -> None:
+    answered: list[int] = []
+
+    async def scenario(session: Session, server: SerialServer) -> None:
+        async def caller(number: int) -> None:
+            await session.call(Echo, "/echo", Echo.Request(number), timeout=None)
+            answered.append(number)
+
+        halted = [session.start(Echo, "/echo", timeout=None) for _ in range(50)]
+        await asyncio.sleep(0.05)
+        for task in halted:
+            task.cancel()
+        async with asyncio.TaskGroup() as callers:
+            for number in range(100):
+                callers.create_task(caller(number))
+                await asyncio.sleep(WORK / 2)
+        assert answered == list(range(100))
+
+    play(scenario)
+
+
+def test_those_passed_over_are_sent_when_no_caller_leaves_any_more() -> None:
+    """No request is answered and no caller comes, so only a poll of the graph lets them go."""
+
+    async def scenario(session: Session, server: SerialServer) -> None:
+        await keep_leaving(session, 30, 4.0, patience=0.35)
+        await asyncio.sleep(0.4)
+        server.work = 1000.0
+        patient = [session.start(Echo, "/echo", timeout=None) for _ in range(6)]
+        await asyncio.sleep(0.1)
+        assert session.pool.statistics().in_flight < 6
+        await asyncio.sleep(3.0)
+        assert session.pool.statistics().in_flight == 6
+        for task in patient:
+            task.cancel()
+
+    play(scenario, work=0.1)
+
+
+def test_those_that_give_up_while_there_is_no_server_say_nothing() -> None:
+    async def scenario(session: Session, server: SerialServer) -> None:
+        server.close()
+        await asyncio.sleep(1.0)
+        await keep_leaving(session, 100, 1.0, patience=0.2)
+        dispatch = next(iter(session.pool.service(Echo, "/echo", None).clients)).owner
+        assert isinstance(dispatch, Dispatch)
+        assert dispatch.order.patience.until < 0
 
     play(scenario)

@@ -55,6 +55,27 @@ def test_the_server_works_for_callers_that_still_wait(
     assert result.lost == 0
 
 
+MIXED = tuple(0.2 + 1.8 * (7 * n % 50) / 50 for n in range(50))
+"""Seconds after which callers leave, from 0.2 to 2."""
+
+
+@pytest.mark.parametrize("server", ["rosasync-status", "stock"])
+@pytest.mark.parametrize("load", [2, 4])
+@pytest.mark.parametrize("patience", [(1.0,), MIXED, (1.0, None)], ids=["1", "mixed", "half"])
+def test_the_server_works_for_callers_that_have_not_left(
+    server: str, load: float, patience: tuple[float | None, ...]
+) -> None:
+    result = simulate(Case("rosasync-leaving", server, load=load, timeouts=patience))
+    assert result.goodput >= 0.9
+
+
+@pytest.mark.parametrize("server", ["rosasync-status", "stock"])
+def test_no_more_is_out_than_is_answered_before_callers_leave(server: str) -> None:
+    """A full window would take as long as they wait."""
+    result = simulate(Case("rosasync-leaving", server, work=0.1, load=2, timeouts=(1.0,)))
+    assert result.goodput >= 0.9
+
+
 def test_with_a_client_for_each_call_the_server_works_for_callers_that_still_wait() -> None:
     """Eight requests that are out take longer than a caller has."""
     case = Case(work=0.1, timeouts=(0.5,), load=1.5)
@@ -120,7 +141,7 @@ def test_what_a_server_has_dropped_is_not_sent_again_in_an_overload() -> None:
             assert server.statistics().dropped == 3
             (client,) = session.pool.service(Echo, "/echo", None).clients
             assert isinstance(client.owner, Dispatch)
-            client.owner.overloaded_until = 1000.0
+            client.owner.order.overloaded_until = 1000.0
             errors = await asyncio.gather(*calls, return_exceptions=True)
             assert all("the server is slower than its callers" in str(error) for error in errors)
             assert session.pool.statistics().retried == 0

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from rosasync import Limits, Retry, RosasyncError, Session
-from rosasync._client import response_times
+from rosasync._client import patience, response_times
 from rosasync._client.service import ServicePool
 from rosasync._core.ports import PortDestroyed
 from rosasync.testing._memory.services import MemoryClient
@@ -274,6 +274,9 @@ async def test_random_operations_leave_nothing_behind(
     monkeypatch.setattr(response_times, "PATIENCE_INITIAL", 2 * SHORT)
     monkeypatch.setattr(response_times, "PATIENCE_MIN", SHORT)
     for seed in seeds:
+        # Callers that leave again and again change the order: see test_dispatch_random.
+        in_turn = seed % 2 == 0
+        monkeypatch.setattr(patience, "INTERVAL", math.inf if in_turn else 0.0)
         sent.clear()
         async with running(seed) as run:
             for number in range(steps):
@@ -283,5 +286,5 @@ async def test_random_operations_leave_nothing_behind(
             await until(lambda: timers() <= {"Clients._evict", "Deadlines._expire"})
         # First come, first served: those who gave up before their turn are not among them.
         in_order = [number for number in sent if number in run.in_line]
-        assert in_order == sorted(in_order), seed
+        assert not in_turn or in_order == sorted(in_order), seed
         await until(lambda: not timers())

@@ -13,7 +13,7 @@ import random
 import selectors
 from collections import Counter
 from collections.abc import Callable, Coroutine, Sequence
-from contextlib import AsyncExitStack
+from contextlib import AsyncExitStack, suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -212,8 +212,9 @@ class Case:
     """Callers at random times, and a server that works on one request after another.
 
     Attributes:
-        client: ``rosasync`` or ``stock``.
-        server: ``rosasync`` or ``stock``.
+        client: ``rosasync``, ``rosasync-leaving`` or ``stock``. Callers that leave do so at their
+            timeouts, which their session does not know.
+        server: ``rosasync``, ``rosasync-status`` or ``stock``.
         work: seconds for which the server works on a request.
         exponential: whether that is distributed exponentially, and not constant.
         load: of what the server can do, that is offered.
@@ -272,7 +273,8 @@ async def _simulate(case: Case, choose: random.Random, options: dict[str, Any]) 
         else:
             worker = Worker(case.work, spread)
             serving = await stack.enter_async_context(graph.session())
-            serving.serve(Echo, "/echo", _working(worker), concurrency=1)
+            status = case.server == "rosasync-status"
+            serving.serve(Echo, "/echo", _working(worker), concurrency=1, status=status)
         callers: list[Callable[[float | None], Coroutine[Any, Any, None]]] = []
         for _ in range(case.processes):
             if case.client == "stock":
@@ -280,7 +282,8 @@ async def _simulate(case: Case, choose: random.Random, options: dict[str, Any]) 
                 continue
             session = await stack.enter_async_context(graph.session(**options))
             await session.wait_for_service(Echo, "/echo")
-            callers.append(_caller(session, outcome))
+            leaving = case.client == "rosasync-leaving"
+            callers.append((_leaving_caller if leaving else _caller)(session, outcome))
         ends, number, tasks = loop.time() + case.seconds, 0, set()
         while True:
             await asyncio.sleep(choose.expovariate(case.load / case.work))
@@ -305,6 +308,15 @@ async def _simulate(case: Case, choose: random.Random, options: dict[str, Any]) 
 
 def _caller(session: Session, outcome: Outcome) -> Callable[[float | None], Any]:
     return lambda timeout: outcome.call(session, timeout=timeout)
+
+
+def _leaving_caller(session: Session, outcome: Outcome) -> Callable[[float | None], Any]:
+    async def call(patience: float | None) -> None:
+        with suppress(TimeoutError):
+            async with asyncio.timeout(patience):
+                await outcome.call(session, timeout=None)
+
+    return call
 
 
 def simulate_best(case: Case, *, seed: int = 1) -> Result:
