@@ -10,9 +10,11 @@ from typing import Any
 import pytest
 
 from tests.conftest import Bridge
+from tests.faults.actor import ActorProcess
 from tests.faults.caller import CallerProcess
 from tests.faults.conftest import fault_of
 from tests.faults.table import Row
+from tests.support.action_servers import ActionServerProcess
 from tests.support.clients import ClientProcess
 from tests.support.hosts import NoHosts, run_ip
 from tests.support.lossy import LossyHosts
@@ -161,3 +163,59 @@ async def test_with_a_link_taken_down(
         row = await caller.stop()
     record(row)
     row.check()
+
+
+@asynccontextmanager
+async def goals_out(
+    hosts: LossyHosts, bridge: Bridge, lease: int, count: int
+) -> AsyncIterator[tuple[ActionServerProcess, ActorProcess]]:
+    """An action server on its host, with so many goals of another host; the network is whole."""
+    options: Any = {"lease": lease, "environment": hosts.environment}
+    try:
+        async with (
+            ActionServerProcess(prefix=hosts.on("server"), **options) as server,
+            ActorProcess(prefix=hosts.on("client"), **options) as actor,
+        ):
+            await server.serve("/held", hold=True, idle=True)
+            await actor.open_session(bridge)
+            await actor.act("/held", count)
+            await server.goals("/held", at_least=count)
+            yield server, actor
+            await actor.close_session()
+    finally:
+        hosts.set(loss=0.0)
+
+
+@pytest.mark.faults
+async def test_goals_of_a_cut_network(hosts: LossyHosts, bridge: Bridge, full: bool) -> None:
+    """The peers do not notice the cut. Nothing is lost, and what was left in it is cancelled."""
+    async with goals_out(hosts, bridge, lease=20, count=10) as (server, actor):
+        hosts.set(loss=1.0)
+        await actor.leave(4)
+        await asyncio.sleep((200 if full else 8) * TICK)
+        assert len(await server.running("/held")) == 10
+        hosts.set(loss=0.0)
+        await runs(server, 6)
+        await server.release("/held")
+        assert await actor.ends() == {"result": 6, "CancelledError": 4}
+
+
+@pytest.mark.faults
+async def test_goals_of_a_network_that_is_cut_for_longer(hosts: LossyHosts, bridge: Bridge) -> None:
+    """Each peer is gone for the other. When it is back, its goals are cancelled."""
+    async with goals_out(hosts, bridge, lease=1, count=10) as (server, actor):
+        hosts.set(loss=1.0)
+        await actor.leave(4)
+        assert await actor.ends() == {"ServerGone": 6, "CancelledError": 4}
+        assert len(await server.running("/held")) == 10
+        hosts.set(loss=0.0)
+        await runs(server, 0)
+
+
+async def runs(server: ActionServerProcess, count: int) -> None:
+    """Wait until so many goals of the server run."""
+    for _ in range(200):
+        if len(await server.running("/held")) == count:
+            return
+        await asyncio.sleep(LIMIT / 100)
+    raise AssertionError(f"{len(await server.running('/held'))} goals run, not {count}")
