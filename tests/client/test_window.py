@@ -520,6 +520,14 @@ class TestExpected:
                 for seconds in (0.0, 0.5 * needed, 0.99 * needed, 1.01 * needed, 3.0 * needed):
                     assert bench.window.answers_in(seconds, bench.now) == (seconds >= needed)
 
+    def test_a_full_window_is_expected_to_take_longer_than_every_answer_so_far(self) -> None:
+        bench = Bench(size=10)
+        self.serve(bench, [0.1] * 3, at_once=1)
+        bench.send(9)
+        assert bench.window.expected(bench.now) == pytest.approx(1.1)
+        assert not bench.window.answers_in(1.0, bench.now)
+        assert bench.window.answers_in(1.2, bench.now)
+
     def test_it_is_forgotten_with_the_server_and_after_some_time(self) -> None:
         bench = Bench(size=10)
         self.serve(bench, [0.1] * 10, at_once=1)
