@@ -69,16 +69,24 @@ QUICK_AGAIN: list[Step] = [
     ("wait", 0.3, None),
     ("call", 15, 2000),
 ]
-# Callers leave after 0.3 s, in turns, and others stay: they are patient.
+# Twice as many callers as are answered leave after 0.3 s. A few stay: they are patient.
 LEAVERS: list[Step] = [
     *LEARN,
-    ("work", 0.05, None),
-    *([("leaving", 10, 300), ("call", 2, None), ("wait", 0.1, None), ("wait", 0.02, None)] * 8),
+    ("work", 0.01, None),
+    *([("leaving", 10, 300), ("call", 1, None), ("wait", 0.02, None), ("wait", 0.02, None)] * 40),
+]
+# Some leave so soon that no other has time enough for sure, and then no more come.
+IN_DOUBT: list[Step] = [
+    *LEARN,
+    ("work", 0.01, None),
+    *([("leaving", 5, 100), ("leaving", 5, 2000), ("wait", 0.02, None)] * 40),
+    *([("wait", 0.1, None)] * 20),
 ]
 # An answer takes nearly as long as they wait, so the window is never full.
 SLOW_LEAVERS: list[Step] = [
     *LEARN,
-    *([("leaving", 15, 500), ("call", 1, None), ("wait", 0.3, None)] * 10),
+    *([("leaving", 5, 500), ("leaving", 5, 2000), ("wait", 0.3, None)] * 10),
+    *([("wait", 0.1, None)] * 20),
     ("call", 10, None),
 ]
 # No caller has time enough, and nothing is out.
@@ -92,6 +100,7 @@ class Model:
         waiting: the numbers of the calls that were made and have neither been sent nor ended.
         since: when each call was made.
         turns: the calls that were let go since a patient one was.
+        passed: the numbers of the calls that were passed over before the next decision.
         assigning: whether `Dispatch.assign` runs.
         wrong: what was wrong with decisions. Not raised there, because the library would treat that
             as a send that fails.
@@ -105,6 +114,7 @@ class Model:
         self.waiting: set[int] = set()
         self.since: list[float] = []
         self.turns = 0
+        self.passed: set[int] = set()
         self.tasks: list[asyncio.Task[None]] = []
         self.numbers = iter(range(1_000_000))
         self.assigning = False
@@ -191,6 +201,7 @@ class Model:
             assert left_of(call, now) >= client.window.expected(now), "sent again too late"
         else:
             self.check_order(client, call, others, now)
+        self.passed = {number_of(waiter) for waiter in dispatch.passed}
 
     def check_order(self, client: Client, call: Any, others: list[Any], now: float) -> None:
         """Check that none of these callers should have been sent instead."""
@@ -199,7 +210,9 @@ class Model:
         fresh = [other for other in others if self.is_fresh(other, needed, now)]
         if self.is_fresh(call, needed, now):
             assert not any(self.is_fresh(other, needed, now) for other in earlier), "overtaken"
-            patient = any(self.is_patient(other, needed, now) for other in others)
+            # Not those that this decision has passed over.
+            before = [other for other in others if number_of(other) in self.passed]
+            patient = any(self.is_patient(other, needed, now) for other in before)
             assert not (patient and self.turns >= TURNS - 1), "a patient caller had its turn"
             self.turns += 1
         elif self.is_patient(call, needed, now):
@@ -306,6 +319,7 @@ def watched() -> Iterator[list[Model]]:
         return send(client, call, now)
 
     def watched_assign(dispatch: Dispatch) -> None:
+        models[-1].passed = {number_of(waiter) for waiter in dispatch.passed}
         models[-1].assigning = True
         assign(dispatch)
         models[-1].assigning = False
@@ -323,6 +337,7 @@ def watched() -> Iterator[list[Model]]:
 @example(steps=QUICK_AGAIN, limits=Limits(waiting=5), spread=False)
 @example(steps=PROBE, limits=Limits(in_flight=1), spread=False)
 @example(steps=LEAVERS, limits=Limits(), spread=False)
+@example(steps=IN_DOUBT, limits=Limits(), spread=False)
 @example(steps=SLOW_LEAVERS, limits=Limits(grace=0.5), spread=True)
 def test_any_overload(
     watched: list[Model], steps: list[Step], limits: Limits, spread: bool
