@@ -12,6 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from rosasync._ros.discovery import introduce, own_ports, ports_of, udp_sockets
+from rosasync._ros.processes import PARENT, read_stat
 
 __all__ = ["introduce_program"]
 
@@ -79,9 +80,7 @@ def _family(program: int) -> set[int]:
     for name in os.listdir("/proc"):
         if name.isdecimal():
             with suppress(OSError):
-                # The name in parentheses may contain anything. The state and the parent follow.
-                fields = Path(f"/proc/{name}/stat").read_text().rpartition(")")[2].split()
-                parents[int(name)] = int(fields[1])
+                parents[int(name)] = int(read_stat(name)[PARENT])
     family = {program}
     while more := {process for process, parent in parents.items() if parent in family} - family:
         family |= more

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Collection, Iterable
-from pathlib import Path
 
 from rclpy.node import Node
 
 from rosasync._ros import fastdds
 from rosasync._ros.discovery import ports_of, udp_sockets
 from rosasync._ros.endpoints import GUID_PREFIX, gid_of
+from rosasync._ros.processes import STATE, THREADS, read_stat
 
 __all__ = ["DISCOVERY_TOPIC", "ended", "of_this_host", "participants"]
 
@@ -26,8 +26,6 @@ PROCESS = slice(4, 6)
 
 DEAD_STATES = ("Z", "X", "x")
 """States of a process that has ended (``man 5 proc``)."""
-THREADS = 17
-"""The position of the number of threads in ``/proc/[pid]/stat``, counted from the state."""
 
 DISCOVERY_TOPIC = "ros_discovery_info"
 """The topic on which each context announces its nodes: one writer for each participant."""
@@ -101,12 +99,10 @@ def _living_processes() -> Callable[[int], bool]:
 def _is_alive(process: str) -> bool:
     """Return whether a process is more than the entry that its parent has not collected."""
     try:
-        stat = Path(f"/proc/{process}/stat").read_text()
+        fields = read_stat(process)
     except FileNotFoundError:
         return False
     except OSError:
         return True
-    # The name, in parentheses, may contain anything. The state is the next field.
-    fields = stat.rpartition(")")[2].split()
     # A process whose first thread has ended looks the same, but for its other threads.
-    return fields[0] not in DEAD_STATES or int(fields[THREADS]) > 1
+    return fields[STATE] not in DEAD_STATES or int(fields[THREADS]) > 1
