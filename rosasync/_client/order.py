@@ -131,8 +131,8 @@ class Order:
             # The last to come would be the first to be in time again.
             if next(reversed(self.passed.values())) + short - now < needed:
                 return None
-        for waiter, since in tuple(self.passed.items()):
-            if waiter.gone or min(_deadline_of(waiter), since + short) - now >= needed:
+        for waiter in tuple(self.passed):
+            if waiter.gone or self._ends_at(waiter, short) - now >= needed:
                 del self.passed[waiter]
                 if not waiter.gone:
                     self._turn += 1
