@@ -18,7 +18,7 @@ from benchmarks.trials import Trials
 from benchmarks.work import Work
 from tests.support.child import ROOT
 
-__all__ = ["PROGRAMS", "Start", "check_programs", "draw", "heading", "measure", "rows", "section"]
+__all__ = ["PROGRAMS", "Start", "draw", "heading", "measure", "rows", "section"]
 
 COMMAND = "cold"
 WORK = Work(srv_name="/bench/cold")
@@ -65,19 +65,6 @@ class Start:
 
     program: str
     seconds: float | None
-
-
-def check_programs(programs: Sequence[str]) -> Sequence[str]:
-    """Return the programs.
-
-    Raises:
-        ValueError: one does not exist.
-    """
-    if unknown := set(programs) - set(PROGRAMS):
-        raise ValueError(
-            f"no program {', '.join(sorted(unknown))}; there are {', '.join(PROGRAMS)}"
-        )
-    return programs
 
 
 def measure(

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from rich.progress import Progress
 
 from benchmarks import actions, cold, crash, faults, goodput, overload, sharing, status
+from benchmarks.names import check_names
 from benchmarks.pages import replace_section
 from benchmarks.tables import goal_table, make_console, make_table
 from benchmarks.trials import Goal, Trials
@@ -197,7 +198,8 @@ def start(
         replace(split(programs) or crash.CONTESTANTS, split(places), processes, before, json)
         return
     with checked():
-        chosen = cold.check_programs(split(programs) or [*cold.PROGRAMS])
+        chosen = split(programs) or [*cold.PROGRAMS]
+        check_names("program", chosen, cold.PROGRAMS)
     isolate()
     trials = Trials(cold.COMMAND, {"processes": processes})
     total = processes * len(chosen)
@@ -216,7 +218,7 @@ def replace(
     """Measure processes that replace killed ones."""
     with checked():
         chosen = crash.check_contestants(programs, before)
-        crash.check_places(places)
+        check_names("place", places, crash.PLACES)
     isolate()
     trials = Trials(crash.COMMAND, {"restarts": restarts})
     total = len(places) * len(crash.SIDES) * restarts * len(chosen)

@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.names import check_names
 from benchmarks.pages import markdown_table
 from benchmarks.server import WorkServer
 from benchmarks.sharing import BEFORE, older
@@ -40,7 +41,6 @@ __all__ = [
     "Place",
     "Restart",
     "check_contestants",
-    "check_places",
     "heading",
     "measure",
     "placed",
@@ -213,22 +213,8 @@ def check_contestants(contestants: Sequence[str], before: Path | None) -> Sequen
     Raises:
         ValueError: one does not exist.
     """
-    if unknown := set(contestants) - set(CONTESTANTS):
-        raise ValueError(
-            f"no contestant {', '.join(sorted(unknown))}; there are {', '.join(CONTESTANTS)}"
-        )
+    check_names("contestant", contestants, CONTESTANTS)
     return [name for name in contestants if name != BEFORE or before is not None]
-
-
-def check_places(places: Sequence[str]) -> Sequence[str]:
-    """Return the places.
-
-    Raises:
-        ValueError: one does not exist.
-    """
-    if unknown := set(places) - set(PLACES):
-        raise ValueError(f"no place {', '.join(sorted(unknown))}; there are {', '.join(PLACES)}")
-    return places
 
 
 def measure(

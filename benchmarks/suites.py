@@ -8,6 +8,7 @@ from collections.abc import Callable, Collection
 from functools import partial
 
 from benchmarks.contestants import CONTESTANTS
+from benchmarks.names import check_names
 from benchmarks.runner import Scenario
 from benchmarks.targets import PEERS, TARGETS
 from benchmarks.ticks import make_ticks
@@ -220,10 +221,7 @@ def make_suite(
     Raises:
         ValueError: a contestant that does not exist.
     """
-    if unknown := set(contestants) - set(CONTESTANTS):
-        raise ValueError(
-            f"no contestant {', '.join(sorted(unknown))}; there are {', '.join(CONTESTANTS)}"
-        )
+    check_names("contestant", contestants, CONTESTANTS)
     suite = [_narrow(scenario, contestants) for scenario in SUITES[name]()]
     suite = [scenario for scenario in suite if scenario.contestants]
     return [_shorten(scenario) for scenario in suite] if quick else suite

@@ -29,6 +29,7 @@ from benchmarks import (
 from benchmarks.contestants import CONTESTANTS, make_contestant
 from benchmarks.contestants.base import LoggedCall
 from benchmarks.meter import Usage
+from benchmarks.names import check_names
 from benchmarks.report import write_report
 from benchmarks.results import Results, Turn
 from benchmarks.runner import Scenario
@@ -218,11 +219,11 @@ def test_the_cells_of_a_command_are_checked(tmp_path: Path) -> None:
         faults.plans([faults.SLOW], ["before"])
     assert faults.plans([faults.SLOW], ["before"], tmp_path) == [(faults.SLOW, "before")]
     with pytest.raises(ValueError, match="no program stock"):
-        cold.check_programs(["stock"])
+        check_names("program", ["stock"], cold.PROGRAMS)
     with pytest.raises(ValueError, match="no contestant rclpy; there are stock, "):
         crash.check_contestants(["stock", "rclpy"], None)
     with pytest.raises(ValueError, match="no place Mars; there are LOCALHOST, "):
-        crash.check_places(["SUBNET", "Mars"])
+        check_names("place", ["SUBNET", "Mars"], crash.PLACES)
 
 
 def test_the_goals_of_sharing() -> None:
