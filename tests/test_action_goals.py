@@ -180,9 +180,7 @@ async def test_a_goal_of_a_server_that_was_cut_off_is_cancelled_when_it_is_back(
 ) -> None:
     async with fake_graph.session() as session:
         task = asyncio.create_task(session.act(Fibonacci, "/fibonacci"))
-        await virtual_clock.advance(0.1)
-        server.answer_send(0)
-        await virtual_clock.advance(0.1)
+        await accept(virtual_clock, server)
         if leaves:
             task.cancel()
         server.cut()
@@ -223,9 +221,7 @@ async def test_a_server_that_does_not_come_back_is_not_warned_of(
 ) -> None:
     async with fake_graph.session() as session:
         task = asyncio.create_task(session.act(Fibonacci, "/fibonacci"))
-        await virtual_clock.advance(0.1)
-        server.answer_send(0)
-        await virtual_clock.advance(0.1)
+        await accept(virtual_clock, server)
         server.vanish()
         with pytest.raises(ServerGone):
             await virtual_clock.skip(task)
@@ -239,9 +235,7 @@ async def test_a_detached_goal_of_a_server_that_was_cut_off_runs_on(
 ) -> None:
     async with fake_graph.session() as session:
         pursuit = asyncio.create_task(detach(session))
-        await virtual_clock.advance(0.1)
-        server.answer_send(0)
-        await virtual_clock.advance(0.1)
+        await accept(virtual_clock, server)
         server.cut()
         with pytest.raises(ServerGone):
             await virtual_clock.skip(pursuit)
@@ -249,6 +243,13 @@ async def test_a_detached_goal_of_a_server_that_was_cut_off_runs_on(
         server.come_back()
         await virtual_clock.advance(1.0)
         assert list(server.statuses.values()) == [GoalStatus.EXECUTING]
+
+
+async def accept(virtual_clock: VirtualClock, server: ScriptedAction) -> None:
+    """Accept the goal that has just been started."""
+    await virtual_clock.advance(0.1)
+    server.answer_send(0)
+    await virtual_clock.advance(0.1)
 
 
 async def detach(session: Session) -> None:

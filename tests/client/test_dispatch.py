@@ -133,17 +133,23 @@ def test_a_call_without_a_deadline_is_never_passed_over() -> None:
     play(scenario)
 
 
+async def call_and_note(
+    session: Session, number: int, timeout: float | None, answered: list[int]
+) -> None:
+    """Make a call, and note its number when it is answered."""
+    await session.call(Echo, "/echo", Echo.Request(number), timeout=timeout)
+    answered.append(number)
+
+
 def test_among_those_with_time_enough_the_first_to_come_is_served_first() -> None:
     answered: list[int] = []
 
     async def scenario(session: Session, server: SerialServer) -> None:
-        async def caller(number: int) -> None:
-            await session.call(Echo, "/echo", Echo.Request(number), timeout=60.0)
-            answered.append(number)
-
         load = asyncio.create_task(keep_calling(session, 30, 5.0, timeout=0.2))
         await asyncio.sleep(LEARN)
-        await asyncio.gather(*(caller(number) for number in range(50)))
+        await asyncio.gather(
+            *(call_and_note(session, number, 60.0, answered) for number in range(50))
+        )
         assert answered == sorted(answered)
         await load
 
@@ -248,13 +254,11 @@ def test_patient_callers_are_served_in_their_order_while_others_leave() -> None:
     answered: list[int] = []
 
     async def scenario(session: Session, server: SerialServer) -> None:
-        async def caller(number: int) -> None:
-            await session.call(Echo, "/echo", Echo.Request(number), timeout=None)
-            answered.append(number)
-
         load = asyncio.create_task(keep_leaving(session, 400, 4.0, patience=0.2))
         await asyncio.sleep(LEARN)
-        await asyncio.gather(*(caller(number) for number in range(40)))
+        await asyncio.gather(
+            *(call_and_note(session, number, None, answered) for number in range(40))
+        )
         assert answered == sorted(answered)
         await load
 
@@ -265,17 +269,13 @@ def test_callers_cancelled_together_do_not_change_the_order() -> None:
     answered: list[int] = []
 
     async def scenario(session: Session, server: SerialServer) -> None:
-        async def caller(number: int) -> None:
-            await session.call(Echo, "/echo", Echo.Request(number), timeout=None)
-            answered.append(number)
-
         halted = [session.start(Echo, "/echo", timeout=None) for _ in range(50)]
         await asyncio.sleep(0.05)
         for task in halted:
             task.cancel()
         async with asyncio.TaskGroup() as callers:
             for number in range(100):
-                callers.create_task(caller(number))
+                callers.create_task(call_and_note(session, number, None, answered))
                 await asyncio.sleep(WORK / 2)
         assert answered == list(range(100))
 
