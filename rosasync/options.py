@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import numbers
 import operator
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, SupportsFloat, SupportsIndex
+from typing import TYPE_CHECKING, Any, Literal, SupportsFloat, SupportsIndex, TypeVar
 
 from rosasync.tracing import Trace, check_trace
 from rosasync.typing import Timeout
@@ -23,12 +25,15 @@ __all__ = [
     "SessionOptions",
     "check_count",
     "check_flag",
+    "check_hook",
     "check_limits",
     "check_retry",
     "check_seconds",
     "check_timeout",
     "check_wait",
 ]
+
+HookT = TypeVar("HookT")
 
 
 def check_seconds(name: str, value: SupportsFloat) -> float:
@@ -44,7 +49,7 @@ def check_seconds(name: str, value: SupportsFloat) -> float:
     return number
 
 
-def check_timeout(value: Timeout, default: float | None) -> float | None:
+def check_timeout(value: Timeout, default: float | None, name: str = "timeout") -> float | None:
     """Return a timeout in seconds, or None for no deadline; ``...`` gives ``default``.
 
     A negative timeout gives 0: it is the time that is left until a deadline, and it has run out.
@@ -57,7 +62,7 @@ def check_timeout(value: Timeout, default: float | None) -> float | None:
         return default
     if value is None:
         return None
-    seconds = _as_float("timeout", value, "a number of seconds")
+    seconds = _as_float(name, value, "a number of seconds or None")
     return None if seconds == math.inf else max(0.0, seconds)
 
 
@@ -91,6 +96,31 @@ def check_flag(name: str, value: object) -> None:
     """Raise `TypeError` unless ``value`` is a bool."""
     if not isinstance(value, bool):
         raise TypeError(f"{name} must be True or False, not {type(value).__name__}")
+
+
+def check_hook(name: str, hook: HookT, *arguments: str) -> HookT:
+    """Return a hook, or None.
+
+    Args:
+        name: its name.
+        hook: the hook.
+        arguments: the names of what it is called with; none if it may take different ones.
+
+    Raises:
+        TypeError: it is not callable, or not with these arguments.
+    """
+    if hook is None:
+        return hook
+    if not callable(hook):
+        raise TypeError(f"{name} must be callable, not {type(hook).__name__}")
+    # ValueError: some functions of C have no signature.
+    with suppress(ValueError):
+        try:
+            inspect.signature(hook).bind(*arguments) if arguments else None
+        except TypeError:
+            shape = f"{name}({', '.join(arguments)})"
+            raise TypeError(f"{name} is called as {shape}, and {hook!r} cannot be") from None
+    return hook
 
 
 def check_limits(limits: Limits) -> None:

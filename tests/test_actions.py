@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
 import pytest
@@ -21,6 +21,7 @@ from rosasync import (
     ServiceUnavailable,
     Session,
     SessionClosed,
+    UsageError,
 )
 from rosasync._actions import server_watch
 from tests.support.action_servers import ActionServerProcess
@@ -235,6 +236,54 @@ async def test_a_goal_can_be_followed_by_another_session(
         async with other.attach(Fibonacci, "/held", uuid4()) as unknown:
             with pytest.raises(GoalRejected, match="does not know the goal"):
                 await unknown.result()
+
+
+@pytest.mark.parametrize("why", ["detached", "attached", "refused"])
+async def test_a_goal_that_runs_on_after_its_block_is_not_waited_for(
+    session: Session, action_server: ActionServerProcess, why: str
+) -> None:
+    """Neither after the block, nor by tasks that waited in it; it may still be cancelled."""
+    await action_server.serve("/held", hold=True, cancel=why != "refused")
+    tasks: list[asyncio.Task[Any]] = []
+
+    async def read() -> list[Any]:
+        return [feedback async for feedback in goal]
+
+    async with session.goal(Fibonacci, "/held", cancel_timeout=LIMIT) as goal:
+        if why != "refused":
+            goal.detach()
+        if why != "attached":
+            tasks += map(asyncio.create_task, (goal.result(), read()))
+            await asyncio.sleep(0)
+    if why == "attached":
+        async with session.attach(Fibonacci, "/held", goal.id) as goal:
+            tasks += map(asyncio.create_task, (goal.result(), read()))
+            await asyncio.sleep(0)
+    async with asyncio.timeout(LIMIT):
+        for waited in (tasks[0], goal.result(), goal.result(timeout=LIMIT)):
+            with pytest.raises(UsageError, match=r"not followed any more.*session.attach\("):
+                await waited
+        assert await tasks[1] == await read() == []
+    assert not goal.done
+    assert await action_server.running("/held") == [goal.id]
+    if why == "refused":
+        with pytest.raises(CancelRejected):
+            await goal.cancel()
+        await action_server.release("/held")
+    else:
+        await goal.cancel()
+        await none_runs(action_server, "/held")
+
+
+async def test_detaching_after_the_block_is_too_late(
+    session: Session, action_server: ActionServerProcess
+) -> None:
+    await action_server.serve("/held", hold=True, cancel=False)
+    async with session.goal(Fibonacci, "/held", cancel_timeout=0.0) as goal:
+        pass
+    with pytest.raises(UsageError, match="is being cancelled already: call detach"):
+        goal.detach()
+    await action_server.release("/held")
 
 
 async def test_an_ended_goal_still_has_its_result(

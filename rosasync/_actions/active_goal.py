@@ -54,7 +54,8 @@ class ActiveGoal:
         asked: whether its result has been asked for, as it is from the acceptance on.
         outcome: how it has ended.
         settled: set with the outcome.
-        ended: set with the outcome, or when the session closes.
+        ended: set with the outcome, when the session closes, or when its last handle has left it.
+        is_followed: whether a handle may still learn how it ends.
         ending: the background task that cancels it, after its caller has left.
         detached: whether it is to run on when its caller leaves.
         plan: when to ask for its result.
@@ -72,6 +73,7 @@ class ActiveGoal:
         "ended",
         "ending",
         "id",
+        "is_followed",
         "key",
         "outcome",
         "plan",
@@ -98,6 +100,7 @@ class ActiveGoal:
         self.ended = asyncio.Event()
         self.ending: asyncio.Task[None] | None = None
         self.detached = False
+        self.is_followed = True
         self.plan = ResultPlan()
         self._make_closed: Callable[[], Exception] | None = None
         self._readers: dict[FeedbackQueue, None] = {}
@@ -128,6 +131,7 @@ class ActiveGoal:
     def leave(self, reader: FeedbackQueue) -> None:
         """Pass no more feedback to a handle; idempotent."""
         self._readers.pop(reader, None)
+        reader.close()
 
     def put_feedback(self, serialized: bytes) -> None:
         """Pass a feedback message to every handle."""
@@ -161,8 +165,13 @@ class ActiveGoal:
         self.answered.set()
         self._wake()
 
+    def unfollow(self, make_error: Callable[[], Exception]) -> None:
+        """Let those who wait for its end go with an error: nothing more is learnt of it."""
+        self.is_followed = False
+        self.close(make_error)
+
     def result(self) -> Outcome:
-        """Return the outcome, once the goal has ended; raise the error of the session's end."""
+        """Return the outcome, once the goal has ended; raise the error of another end."""
         if self.outcome is None:
             assert self._make_closed is not None
             raise self._make_closed()
@@ -202,10 +211,15 @@ class FeedbackQueue:
     Args:
         size: how many are kept.
         read: deserializes a message, or raises ValueError.
+
+    Attributes:
+        dropped: how many were dropped, because they were not read in time, or cannot be read.
+        closed: whether no more messages come.
     """
 
     def __init__(self, size: int, read: Callable[[bytes], Any]) -> None:
         self.dropped = 0
+        self.closed = False
         self._messages: deque[bytes] = deque(maxlen=size)
         self._read = read
         self._waiters: set[asyncio.Future[None]] = set()
@@ -217,8 +231,13 @@ class FeedbackQueue:
         self._messages.append(serialized)
         self.wake()
 
+    def close(self) -> None:
+        """Expect no more messages: the handle has left its goal. Those that are kept stay."""
+        self.closed = True
+        self.wake()
+
     def wake(self) -> None:
-        """Wake the readers: there is a message, or the goal has ended."""
+        """Wake the readers: there is a message, or there will be none."""
         for waiter in self._waiters:
             if not waiter.done():
                 waiter.set_result(None)

@@ -120,7 +120,8 @@ class Cancellations:
 
     async def cancel(self, goal: ActiveGoal, timeout: float | None) -> None:
         """Cancel a goal for its caller; see `Goal.cancel`."""
-        if goal.ended.is_set():
+        # One that its block has left running may be cancelled nevertheless.
+        if goal.ended.is_set() and goal.is_followed:
             goal.result()
             return
         if goal.status is GoalStatus.CANCELING:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Iterable
 from contextlib import AsyncExitStack, suppress
+from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol
 
 from rosasync._actions.active_goal import ActiveGoal, FeedbackQueue, Outcome
@@ -115,6 +116,9 @@ class ActionClient:
         goal.trace = self._tracing.follow(self.action.name, self.action.type_name)
         deadline = None if timeout is None else goal.started + timeout
         try:
+            self._owner.check_open()
+            if timeout == 0:
+                raise self.timed_out(goal, 0.0)
             self._add(goal)
             await self._watch.reach(goal, deadline, wait)
             client, lease = await self._lease(deadline)
@@ -159,7 +163,8 @@ class ActionClient:
             with suppress(ContextShutdown):
                 if not self._watch.exists():
                     return self.errors.unavailable(goal)
-            what = f"the goal was not sent within {seconds:.3g} s: no place in the window"
+            reason = "no place in the window" if seconds else "no time was left for it"
+            what = f"the goal was not sent within {seconds:.3g} s: {reason}"
         elif not goal.answered.is_set():
             what = f"the goal was sent, but not answered within {seconds:.3g} s; it is cancelled"
         else:
@@ -215,9 +220,11 @@ class ActionClient:
         self.goals.add(goal)
 
     def _remove(self, goal: ActiveGoal) -> None:
-        """Drop a goal, if it is out."""
+        """Drop a goal, if it is out. If it has not ended, nothing more is learnt of it."""
         if self.goals.remove(goal):
             self._results.forget(goal.key)
+            if not goal.ended.is_set():
+                goal.unfollow(partial(self.errors.not_followed, goal))
 
     def _settle(self, goal: ActiveGoal, outcome: Outcome) -> None:
         goal.settle(outcome)

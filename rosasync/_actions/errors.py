@@ -15,6 +15,7 @@ from rosasync.errors import (
     QueueTimeout,
     ServerGone,
     ServiceUnavailable,
+    UsageError,
 )
 
 if TYPE_CHECKING:
@@ -57,6 +58,14 @@ class GoalErrors:
     def server_gone(self, goal: ActiveGoal, what: str) -> CallError:
         """Return the error for a goal whose server has vanished."""
         return self._call(ServerGone, f"{what} (goal {goal.id})", self._elapsed(goal))
+
+    def not_followed(self, goal: ActiveGoal) -> UsageError:
+        """Return the error for a handle whose block has left a goal that had not ended."""
+        return UsageError(
+            f"{self._action.name}: goal {goal.id} is not followed any more, because its block was "
+            "left before its end: await its result in the block, or follow it with "
+            "`async with session.attach(…, goal.id)`"
+        )
 
     def translate(self, goal: ActiveGoal, error: ErrorT, what: str) -> ErrorT | CallError:
         """Return the error of the action for an error of one of its services.

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Generic, Self
+from contextlib import AbstractAsyncContextManager
+from typing import TYPE_CHECKING, Any, Generic, NoReturn, Self
 from uuid import UUID
 
 from rosasync._actions.status import GoalStatus
@@ -12,10 +13,12 @@ from rosasync.options import check_timeout
 from rosasync.typing import FeedbackT, ResultT, Timeout
 
 if TYPE_CHECKING:
+    from types import TracebackType
+
     from rosasync._actions.active_goal import ActiveGoal, FeedbackQueue, Outcome
     from rosasync._actions.client import ActionClient
 
-__all__ = ["Goal"]
+__all__ = ["Goal", "GoalBlock"]
 
 
 class Goal(Generic[ResultT, FeedbackT]):
@@ -62,7 +65,7 @@ class Goal(Generic[ResultT, FeedbackT]):
     @property
     def done(self) -> bool:
         """Whether the goal has ended, so that `result` returns or raises at once."""
-        return self._goal.ended.is_set()
+        return self._goal.ended.is_set() and self._goal.is_followed
 
     @property
     def feedback_dropped(self) -> int:
@@ -75,7 +78,7 @@ class Goal(Generic[ResultT, FeedbackT]):
     async def __anext__(self) -> FeedbackT:
         # A cancellation between two messages takes effect in `wait`.
         while (message := self._queue.take()) is None:
-            if self._goal.ended.is_set():
+            if self._goal.ended.is_set() or self._queue.closed:
                 raise StopAsyncIteration
             await self._queue.wait()
         feedback: FeedbackT = message.feedback
@@ -93,6 +96,8 @@ class Goal(Generic[ResultT, FeedbackT]):
             GoalTimeout: the goal has not ended in time.
             ServerGone: the server vanished, or was replaced by one that does not know the goal.
             GoalRejected: an attached goal is not known to the server.
+            UsageError: the block was left, and the goal, which was detached or attached, or which
+                the server does not cancel, is not followed any more.
             SessionClosed, ContextShutdown: the session has ended.
         """
         goal = self._goal
@@ -148,3 +153,47 @@ class Goal(Generic[ResultT, FeedbackT]):
         error = self._client.errors.goal(kind, self._goal, what)
         error.result = outcome.result
         return error
+
+
+class GoalBlock(AbstractAsyncContextManager["Goal[Any, Any]"]):
+    """The block of a goal, to be entered once. It explains itself to those who use it as the goal.
+
+    Args:
+        block: enters and leaves the goal.
+        method: the method that makes the block, for the errors.
+    """
+
+    def __init__(self, block: AbstractAsyncContextManager[Goal[Any, Any]], method: str) -> None:
+        self._block = block
+        self._method = method
+        self._entered = False
+
+    async def __aenter__(self) -> Goal[Any, Any]:
+        if self._entered:
+            raise UsageError(
+                f"a block of {self._method}(…) is entered once: call {self._method}(…) again for "
+                "another goal"
+            )
+        self._entered = True
+        return await self._block.__aenter__()
+
+    async def __aexit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> bool | None:
+        return await self._block.__aexit__(exc_type, exc, traceback)
+
+    def __await__(self) -> NoReturn:
+        raise TypeError(f"{self._method}(…) cannot be awaited: {self._hint}")
+
+    def __aiter__(self) -> NoReturn:
+        raise TypeError(f"{self._method}(…) has no feedback: {self._hint}")
+
+    def __getattr__(self, name: str) -> NoReturn:
+        raise AttributeError(f"{self._method}(…) has no {name!r}: {self._hint}")
+
+    @property
+    def _hint(self) -> str:
+        return f"it is entered, with `async with {self._method}(…) as goal:`, and the goal has that"

@@ -6,15 +6,15 @@ import asyncio
 import inspect
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 from uuid import UUID, uuid4
 
 from rosasync._actions.active_goal import ActiveGoal
 from rosasync._actions.client import ActionClient
-from rosasync._actions.goal import Goal
+from rosasync._actions.goal import Goal, GoalBlock
 from rosasync.errors import CallError
-from rosasync.options import check_count, check_seconds, check_timeout
+from rosasync.options import check_count, check_seconds, check_timeout, check_wait
 
 if TYPE_CHECKING:
     from contextlib import AbstractAsyncContextManager
@@ -107,7 +107,8 @@ class Actions:
         """
         action = self.describe(action_type, action_name)
         message = self._node.make_message(action.action_type.Goal, goal)
-        seconds = check_timeout(accept_timeout, self._timeout)
+        seconds = check_timeout(accept_timeout, self._timeout, "accept_timeout")
+        check_wait(wait)
         if not isinstance(wait, bool):
             wait = check_seconds("wait", wait)
         return ActArguments(action, message, seconds, wait)
@@ -129,6 +130,9 @@ class Actions:
         """
         goal = self._new_goal()
         feedback = 1 if on_feedback is None else ACT_FEEDBACK
+        if timeout == 0:
+            # Otherwise the goal would be sent, because `asyncio.timeout` acts only when this waits.
+            arguments = replace(arguments, accept_timeout=0.0)
         try:
             async with asyncio.timeout(timeout) as deadline:
                 async with self._pursue(arguments, goal, feedback, CANCEL_TIMEOUT) as handle:
@@ -155,7 +159,8 @@ class Actions:
         """Return the context manager of a goal; see `Session.goal`."""
         feedback = check_count("feedback", feedback, 1)
         seconds = check_seconds("cancel_timeout", cancel_timeout)
-        return self._pursue(arguments, self._new_goal(), feedback, seconds)
+        block = self._pursue(arguments, self._new_goal(), feedback, seconds)
+        return GoalBlock(block, "session.goal")
 
     @asynccontextmanager
     async def _pursue(
@@ -192,9 +197,11 @@ class Actions:
     ) -> AbstractAsyncContextManager[Goal[Any, Any]]:
         """Return the context manager of a goal that runs already; see `Session.attach`."""
         if not isinstance(goal_id, UUID):
-            raise TypeError(f"goal_id must be a uuid.UUID, not {type(goal_id).__name__}")
+            hint = "such as goal.id, or uuid.UUID(text)"
+            raise TypeError(f"goal_id must be a uuid.UUID, {hint}, not {type(goal_id).__name__}")
         arguments = self.arguments(action_type, action_name, None, accept_timeout, wait)
-        return self._follow(arguments, goal_id, check_count("feedback", feedback, 1))
+        block = self._follow(arguments, goal_id, check_count("feedback", feedback, 1))
+        return GoalBlock(block, "session.attach")
 
     @asynccontextmanager
     async def _follow(

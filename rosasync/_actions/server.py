@@ -25,9 +25,8 @@ from rosasync._actions.server_goals import ServerGoals
 from rosasync._core.aio import until_done
 from rosasync._core.ports import PortDestroyed, TopicQos
 from rosasync._server.handler_tasks import HandlerTasks
-from rosasync._server.handlers import check_hook
 from rosasync.errors import ContextShutdown, SessionClosed, UsageError
-from rosasync.options import check_count, check_seconds, check_timeout
+from rosasync.options import check_count, check_hook, check_seconds, check_timeout
 from rosasync.statistics import ActionServerStatistics, ServiceKey
 from rosasync.tracing import ServerTracing
 from rosasync.typing import FeedbackT, GoalT, ResultT
@@ -96,7 +95,7 @@ class ActionServer(Generic[GoalT, ResultT, FeedbackT]):
         self._runner = GoalRunner(
             action.name,
             handler,
-            check_hook("on_error", on_error),
+            check_hook("on_error", on_error, "goal", "error"),
             on_busy=check_on_busy(on_busy),
             concurrency=check_count("concurrency", concurrency, 1),
             backlog=check_count("backlog", backlog, 0),
@@ -107,14 +106,14 @@ class ActionServer(Generic[GoalT, ResultT, FeedbackT]):
         )
         self._goal_intake = GoalIntake(
             action.name,
-            check_hook("on_goal", on_goal),
+            check_hook("on_goal", on_goal, "request"),
             self._goals,
             self._runner,
             node.now,
             self._make_goal,
         )
         self._cancel_intake = CancelIntake(
-            action.name, check_hook("on_cancel", on_cancel), self._goals, self._runner
+            action.name, check_hook("on_cancel", on_cancel, "goal"), self._goals, self._runner
         )
         self._feedback_count = 0
         self._ending: Callable[[], Exception] | None = None

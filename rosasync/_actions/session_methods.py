@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, overload
 
-from rosasync._server.handlers import check_hook
-from rosasync.options import check_timeout
+from rosasync.options import check_hook, check_timeout
 from rosasync.typing import ActionType, FeedbackT, GoalT, ResultT, Timeout
 
 if TYPE_CHECKING:
@@ -203,7 +202,8 @@ class ActionMethods:
         core = self._opening.use()
         seconds = check_timeout(timeout, None)
         arguments = core.actions.arguments(action_type, action_name, goal, accept_timeout, wait)
-        return await core.actions.act(arguments, seconds, check_hook("on_feedback", on_feedback))
+        hook = check_hook("on_feedback", on_feedback, "feedback")
+        return await core.actions.act(arguments, seconds, hook)
 
     @overload
     def goal(

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, overload
 
 from rosasync._core.fork import check_fork
 from rosasync.errors import ResponseTimeout, SessionClosed, UsageError
-from rosasync.options import check_timeout
+from rosasync.options import check_hook, check_timeout
 from rosasync.typing import (
     ActionType,
     FeedbackT,
@@ -237,9 +237,10 @@ class Portal:
         self._check_executor()
         seconds = check_timeout(timeout, None)
         arguments = self._actions.arguments(action_type, action_name, goal, accept_timeout, wait)
+        hook = check_hook("on_feedback", on_feedback, "feedback")
 
         def start(seconds: float | None, _: IsCancelled) -> Coroutine[Any, Any, Any]:
-            return self._actions.act(arguments, seconds, on_feedback)
+            return self._actions.act(arguments, seconds, hook)
 
         action = arguments.action
         submission = _Submission(

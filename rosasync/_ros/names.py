@@ -109,7 +109,7 @@ def expand_name(node: Node, given: str, kind: str) -> str:
         TypeError: not a str.
     """
     if not isinstance(given, str):
-        raise TypeError(f"the name of a {kind} must be a str, not {type(given).__name__}")
+        raise TypeError(f"the name of the {kind} must be a str, not {type(given).__name__}")
     if not given.isascii():
         # rclpy's bindings raise a TypeError for what cannot be encoded, such as lone surrogates.
         raise InvalidServiceName(

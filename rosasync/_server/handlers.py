@@ -10,7 +10,7 @@ from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from contextvars import Context
 from dataclasses import dataclass
 from time import monotonic
-from typing import Any, Generic, TypeAlias, TypeVar
+from typing import Any, Generic, TypeAlias
 
 from rosasync._server.blocking import BLOCKING, BlockingReport
 from rosasync._server.counts import CallCounts
@@ -28,7 +28,6 @@ __all__ = [
     "HandlerKind",
     "HandlerRunner",
     "OverloadHook",
-    "check_hook",
     "settle_kind",
 ]
 
@@ -365,20 +364,6 @@ def settle_kind(
                 lambda call: invoke(call.request, call.response), may_defer=False, name=name
             )
     raise TypeError(f"a handler takes (call) or (request, response): {handler!r} does not")
-
-
-HookT = TypeVar("HookT")
-
-
-def check_hook(name: str, hook: HookT) -> HookT:
-    """Return a hook, or None.
-
-    Raises:
-        TypeError: it is not callable.
-    """
-    if hook is not None and not callable(hook):
-        raise TypeError(f"{name} must be callable, not {type(hook).__name__}")
-    return hook
 
 
 def _count_required(handler: Callable[..., Any]) -> int | None:

@@ -21,7 +21,6 @@ from rosasync._server.handlers import (
     Handler,
     HandlerRunner,
     OverloadHook,
-    check_hook,
     settle_kind,
 )
 from rosasync._server.intake import Intake
@@ -32,7 +31,7 @@ from rosasync._server.starting import HandlerStarter
 from rosasync._server.status import ServerStatus, Status, check_status
 from rosasync._status.wire import Outcome
 from rosasync.errors import SessionClosed, UsageError
-from rosasync.options import check_count, check_flag, check_timeout
+from rosasync.options import check_count, check_flag, check_hook, check_timeout
 from rosasync.statistics import ServerStatistics
 from rosasync.tracing import ServerTracing
 from rosasync.typing import RequestT, ResponseT

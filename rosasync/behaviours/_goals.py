@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Generic
 
 from rosasync._actions.proxy import ActionState, AsyncActionProxy
 from rosasync.behaviours._base import Access, Leaf, Status
-from rosasync.options import check_timeout
+from rosasync.options import check_hook, check_timeout, check_wait
 from rosasync.typing import ActionType, FeedbackT, GoalT, ResultT, Timeout
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ class SendGoal(
 
     Raises:
         TypeError: both a goal and a key for it are given.
-        TypeError, ValueError: a timeout does not fit.
+        TypeError, ValueError: a timeout, ``wait`` or a function does not fit.
     """
 
     def __init__(
@@ -80,7 +80,11 @@ class SendGoal(
         if goal is not None and key_goal is not None:
             raise TypeError("give either a goal or a key_goal, not both")
         check_timeout(timeout, None)
-        check_timeout(accept_timeout, None)
+        check_timeout(accept_timeout, None, "accept_timeout")
+        check_wait(wait)
+        check_hook("on_result", on_result, "result")
+        check_hook("on_feedback", on_feedback, "feedback")
+        check_hook("on_error", on_error, "error")
         self.action_type = action_type
         self.action_name = action_name
         self._goal: Any = goal

@@ -239,7 +239,7 @@ class MemoryNode:
     def _resolve(self, given: str, kind: str = "service") -> str:
         """Return the name with a leading slash, that of a private name after the node's."""
         if not isinstance(given, str):
-            raise TypeError(f"the name of a {kind} must be a str, not {type(given).__name__}")
+            raise TypeError(f"the name of the {kind} must be a str, not {type(given).__name__}")
         name = f"{self.name}/{given[2:]}" if given.startswith("~/") else given
         if NAME.fullmatch(name) is None:
             raise InvalidServiceName(f"{given!r} is not a valid {kind} name")
