@@ -8,7 +8,9 @@ from typing import Any, Literal
 
 import pytest
 from action_msgs.msg import GoalStatus, GoalStatusArray
-from test_msgs.action import Fibonacci
+from builtin_interfaces.msg import Time
+from test_msgs.action import Fibonacci, NestedMessage
+from test_msgs.msg import BasicTypes, Builtins
 
 from rosasync import InvalidServiceName
 from rosasync._actions.status import read_statuses, uuid_bytes
@@ -238,6 +240,32 @@ async def test_a_raw_subscription_gets_bytes_with_the_uuid_of_the_goal(world: Wo
     assert sequences([message]) == [(3, 4)]
     with pytest.raises(ValueError, match="cannot be read|not a message"):
         world.node.deserialize(message_type, b"\0\1")
+    publisher.close()
+    subscription.close()
+
+
+async def test_feedback_is_read_without_the_uuid_before_it(world: World) -> None:
+    message_type = NestedMessage.Impl.FeedbackMessage
+    arrived: list[Any] = []
+    subscription = world.node.open_subscription(
+        message_type, "/port_topic", TopicQos(), arrived.append, raw=True
+    )
+    publisher = world.node.open_publisher(message_type, "/port_topic", TopicQos())
+    await until(lambda: publisher.subscriptions() and subscription.publishers())
+    message = message_type()
+    message.goal_id.uuid = [7] * 16
+    # Fields of eight bytes behind some of one, so that their alignment counts.
+    message.feedback = NestedMessage.Feedback(
+        nested_field_no_pkg=Builtins(time_value=Time(sec=1, nanosec=2)),
+        nested_field=BasicTypes(bool_value=True, float64_value=2.5, int64_value=-3),
+        nested_different_pkg=Time(sec=5, nanosec=6),
+    )
+    publisher.publish(message)
+    await until(lambda: arrived)
+    assert world.node.deserialize_feedback(NestedMessage, arrived[0]) == message.feedback
+    for unreadable in (b"", bytes(20), arrived[0][:24]):
+        with pytest.raises(ValueError, match="cannot be read|not a message"):
+            world.node.deserialize_feedback(NestedMessage, unreadable)
     publisher.close()
     subscription.close()
 

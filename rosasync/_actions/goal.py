@@ -77,11 +77,11 @@ class Goal(Generic[ResultT, FeedbackT]):
 
     async def __anext__(self) -> FeedbackT:
         # A cancellation between two messages takes effect in `wait`.
-        while (message := self._queue.take()) is None:
+        feedback: FeedbackT
+        while (feedback := self._queue.take()) is None:
             if self._goal.ended.is_set() or self._queue.closed:
                 raise StopAsyncIteration
             await self._queue.wait()
-        feedback: FeedbackT = message.feedback
         return feedback
 
     async def result(self, timeout: float | None = None) -> ResultT:

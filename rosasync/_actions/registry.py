@@ -141,7 +141,7 @@ class Actions:
                     if on_feedback is not None:
                         async for message in handle:
                             returned = on_feedback(message)
-                            if inspect.isawaitable(returned):
+                            if returned is not None and inspect.isawaitable(returned):
                                 await returned
                     return await handle.result()
         except TimeoutError as error:

@@ -83,13 +83,13 @@ class ActionTopics:
             self._feedback.drain()
 
     def read_feedback(self, serialized: bytes) -> Any:
-        """Return the message in a goal's feedback.
+        """Return the feedback in a message of the topic.
 
         Raises:
             ValueError: it cannot be read, which was logged.
         """
         try:
-            return self._node.deserialize(self._types.FeedbackMessage, serialized)
+            return self._node.deserialize_feedback(self._action.action_type, serialized)
         except ValueError as error:
             logger.error("%s: a feedback message is dropped: %s", self._action.name, error)
             raise

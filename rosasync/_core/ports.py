@@ -430,6 +430,13 @@ class NodePort(Protocol):
             ValueError: it cannot be read.
         """
 
+    def deserialize_feedback(self, action_type: Any, data: bytes) -> Any:
+        """Return the feedback in the bytes of an action's ``FeedbackMessage``.
+
+        Raises:
+            ValueError: it cannot be read.
+        """
+
     def open_publisher(self, msg_type: Any, topic_name: str, qos: TopicQos) -> PublisherPort:
         """Create a publisher; raises as `open_client`."""
 

@@ -48,6 +48,12 @@ __all__ = ["RosNode"]
 JOIN_TIMEOUT = 5.0
 """Seconds to wait for the executor thread to finish its current callback."""
 
+HEADER = 4
+"""Bytes at the beginning of a serialized message that say how the rest is encoded."""
+UUID = 16
+"""Bytes of a goal's UUID, with which its feedback messages begin. What follows can be read without
+it, because no field is aligned to more than eight bytes."""
+
 
 class RosNode:
     """The part of a session that uses rclpy: a `rosasync._core.ports.NodePort`.
@@ -159,6 +165,11 @@ class RosNode:
             raise ValueError(
                 f"a message of {type_name(message_type)} cannot be read: {error}"
             ) from error
+
+    def deserialize_feedback(self, action_type: Any, data: bytes) -> Any:
+        """Return the feedback in the bytes of an action's ``FeedbackMessage``."""
+        # Without the UUID, whose conversion takes longer than that of most feedback.
+        return self.deserialize(action_type.Feedback, data[:HEADER] + data[HEADER + UUID :])
 
     # Clients, services and topics.
 

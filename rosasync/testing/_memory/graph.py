@@ -236,6 +236,10 @@ class MemoryNode:
         """Return a copy of the message that was published."""
         return deserialize(message_type, data)
 
+    def deserialize_feedback(self, action_type: Any, data: bytes) -> Any:
+        """Return a copy of the feedback in a message that was published."""
+        return deserialize(action_type.Impl.FeedbackMessage, data).feedback
+
     def _resolve(self, given: str, kind: str = "service") -> str:
         """Return the name with a leading slash, that of a private name after the node's."""
         if not isinstance(given, str):
