@@ -449,7 +449,10 @@ class NodePort(Protocol):
         *,
         raw: bool = False,
     ) -> SubscriptionPort:
-        """Create a subscription that passes its messages to ``deliver``, as bytes if ``raw``.
+        """Create a subscription that passes its messages to ``deliver``.
+
+        If ``raw``, it passes bytes, and those of messages that come in quick succession may be
+        passed together, a few milliseconds late.
 
         Raises:
             Exception: as `open_client`.

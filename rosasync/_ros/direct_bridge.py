@@ -18,7 +18,7 @@ from rosasync._ros.failures import RclpyError, check_up, explain, is_destroyed
 from rosasync._ros.rcl import Rcl
 from rosasync._ros.responder import Responder, client_of
 from rosasync._ros.services import make_service, qos_of, take_requests
-from rosasync._ros.signals import Signal, Signals
+from rosasync._ros.signals import PacedSignal, Signal, Signals
 from rosasync._ros.topics import DirectSubscription, take_messages
 from rosasync.errors import RosasyncError
 
@@ -70,6 +70,9 @@ class DirectBridge:
         self._clients: Signals[DirectClient] = Signals(loop, _take_responses)
         self._services: Signals[DirectService] = Signals(loop, _take_requests)
         self._subscriptions: Signals[DirectSubscription] = Signals(loop, take_messages)
+        self._raw_subscriptions: Signals[DirectSubscription] = Signals(
+            loop, take_messages, PacedSignal
+        )
         self._poll = BusyPoll(loop, busy_poll) if busy_poll else None
         self._loop = loop
         # What destroys an entity, with its timer that runs after DESTROY_DELAY, or `close` sooner.
@@ -109,8 +112,9 @@ class DirectBridge:
             msg_type, topic_name, _ignore_message, qos, callback_group=self._group, raw=raw
         )
         try:
+            signals = self._raw_subscriptions if raw else self._subscriptions
             return DirectSubscription(
-                self._node, subscription, self._rcl, self._subscriptions, deliver, self._retire
+                self._node, subscription, self._rcl, signals, deliver, self._retire
             )
         except BaseException:
             self._node.destroy_subscription(subscription)
@@ -128,12 +132,13 @@ class DirectBridge:
         """Destroy what is left, then close the eventfds."""
         for client in self._clients.members:
             client.close()
-        for subscription in self._subscriptions.members:
+        for subscription in (*self._subscriptions.members, *self._raw_subscriptions.members):
             subscription.close()
         for destroy in tuple(self._retired):
             self._destroy(destroy)
         self._clients.close()
         self._subscriptions.close()
+        self._raw_subscriptions.close()
         for service in self._services.members:
             service.close()
         self._services.close()

@@ -7,12 +7,14 @@ import os
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
-__all__ = ["Signal", "Signals"]
+__all__ = ["PacedSignal", "Signal", "Signals"]
 
 M = TypeVar("M")
 
 MOST = 16
 """Maximum number of eventfds of one kind. More would locate members better, but use descriptors."""
+PAUSE = 0.002
+"""Seconds between two looks at a `PacedSignal` that is busy."""
 
 
 class Signal(Generic[M]):
@@ -33,7 +35,7 @@ class Signal(Generic[M]):
         self.waiting: dict[M, None] = {}
         self.fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         try:
-            loop.add_reader(self.fd, self._on_readable)
+            loop.add_reader(self.fd, self._look)
         except BaseException:
             os.close(self.fd)
             raise
@@ -44,12 +46,53 @@ class Signal(Generic[M]):
             self._loop.remove_reader(self.fd)
         os.close(self.fd)
 
-    def _on_readable(self) -> None:
+    def _look(self) -> bool:
+        """Take what was signalled; return whether anything was."""
         try:
             signalled = os.eventfd_read(self.fd)
         except BlockingIOError:
-            return
+            return False
         self._take(self, signalled)
+        return True
+
+
+class PacedSignal(Signal[M]):
+    """A signal that does not wake the loop more often than every `PAUSE` seconds.
+
+    To wake the loop costs more than to take a message. So while signals come more often than that,
+    the loop does not watch the eventfd, and a timer looks at it. A signal after a longer pause
+    wakes the loop at once.
+    """
+
+    def __init__(
+        self, loop: asyncio.AbstractEventLoop, take: Callable[[Signal[M], int], None]
+    ) -> None:
+        super().__init__(loop, take)
+        self._busy_until = 0.0
+        # Runs while the loop does not watch the eventfd.
+        self._timer: asyncio.TimerHandle | None = None
+
+    def close(self) -> None:
+        """Close the eventfd."""
+        if self._timer is not None:
+            self._timer.cancel()
+        super().close()
+
+    # Both set the timer before they look, because what is taken may close the signal.
+
+    def _look(self) -> bool:
+        now = self._loop.time()
+        if now < self._busy_until:
+            self._loop.remove_reader(self.fd)
+            self._timer = self._loop.call_later(PAUSE, self._look_again)
+        self._busy_until = now + PAUSE
+        return super()._look()
+
+    def _look_again(self) -> None:
+        self._timer = self._loop.call_later(PAUSE, self._look_again)
+        if not super()._look():
+            self._timer.cancel()
+            self._loop.add_reader(self.fd, self._look)
 
 
 class Signals(Generic[M]):
@@ -61,13 +104,18 @@ class Signals(Generic[M]):
     Args:
         loop: the loop that watches.
         take: called on its thread with a signal and the number of events.
+        kind: the class of the signals.
     """
 
     def __init__(
-        self, loop: asyncio.AbstractEventLoop, take: Callable[[Signal[M], int], None]
+        self,
+        loop: asyncio.AbstractEventLoop,
+        take: Callable[[Signal[M], int], None],
+        kind: type[Signal[M]] = Signal,
     ) -> None:
         self.loop = loop
         self._take = take
+        self._kind = kind
         self._signals: list[Signal[M]] = []
 
     @property
@@ -90,7 +138,7 @@ class Signals(Generic[M]):
     def _add(self, shared: Signal[M] | None) -> Signal[M]:
         """Return a new signal, or ``shared`` if the process is out of file descriptors."""
         try:
-            signal = Signal(self.loop, self._take)
+            signal = self._kind(self.loop, self._take)
         except OSError:
             if shared is None:
                 raise
