@@ -142,10 +142,9 @@ class TestStates:
                 await stopping.wait()
                 return {"sequence": [5]}
 
-        server = session.serve_action(Fibonacci, name, handler)
+        session.serve_action(Fibonacci, name, handler)
         goal = await stock.send(name)
         assert goal is not None
-        await until(lambda: server._feedback.subscriptions())
         assert await stock.cancel_handle(goal) == (NONE, [goal])
         assert await stock.feedback(goal, 1) == [[7]]
         # As rcl: a goal that is being cancelled cannot be cancelled.
@@ -320,7 +319,6 @@ class TestFeedback:
         server = session.serve_action(Fibonacci, name, handler)
         goal = await stock.send(name)
         assert goal is not None
-        await until(lambda: server._feedback.subscriptions())
         go_on.set()
         assert await stock.feedback(goal, 3) == [[0], [1], [2]]
         received.set()
@@ -329,6 +327,24 @@ class TestFeedback:
         with pytest.raises(UsageError, match="has ended"):
             goals[0].feedback({"sequence": [3]})
         await server.aclose()
+
+    async def test_none_is_too_early(
+        self, session: Session, stock: ActionClientProcess, name: str
+    ) -> None:
+        received = asyncio.Event()
+
+        async def handler(goal: AnyGoal) -> Any:
+            for number in range(3):
+                goal.feedback({"sequence": [number]})
+            await received.wait()
+            return fibonacci(0)
+
+        session.serve_action(Fibonacci, name, handler)
+        goal = await stock.send(name)
+        assert goal is not None
+        assert await stock.feedback(goal, 3) == [[0], [1], [2]]
+        received.set()
+        await stock.ended(goal)
 
 
 class TestAcceptance:

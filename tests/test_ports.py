@@ -15,7 +15,7 @@ from test_msgs.msg import BasicTypes, Builtins
 from rosasync import InvalidServiceName
 from rosasync._actions.status import read_statuses, uuid_bytes
 from rosasync._core.gateway import LoopGateway
-from rosasync._core.ports import ClientPort, NodePort, TopicQos
+from rosasync._core.ports import ClientPort, NodePort, PortDestroyed, TopicQos
 from rosasync._ros.node import RosNode
 from rosasync._status.wire import process_of
 from rosasync.options import Limits, SessionOptions
@@ -379,6 +379,31 @@ async def test_clients_and_servers_of_a_node_are_of_one_process(world: World) ->
     client.close()
     port.stop()
     port.close()
+
+
+async def test_a_publisher_knows_which_clients_it_reaches(world: World) -> None:
+    client = world.client()
+    message_type = Fibonacci.Impl.FeedbackMessage
+    publisher = world.node.open_publisher(message_type, "/port_topic", TopicQos())
+    # In memory, nobody can subscribe too late.
+    assert publisher.reaches(client.identity) is (world.node.bridge == "memory")
+    assert publisher.acknowledged()
+    received: list[Any] = []
+    subscription = world.node.open_subscription(
+        message_type, "/port_topic", TopicQos(), received.append
+    )
+    await until(lambda: publisher.reaches(client.identity) and subscription.publishers())
+    publisher.publish(feedback(1))
+    await until(publisher.acknowledged)
+    await until(lambda: received)
+    subscription.close()
+    await until(lambda: not publisher.reaches(client.identity) or world.node.bridge == "memory")
+    publisher.close()
+    client.close()
+    if world.node.bridge != "memory":
+        for query in (publisher.acknowledged, lambda: publisher.reaches(client.identity)):
+            with pytest.raises(PortDestroyed):
+                query()
 
 
 async def test_publishers_are_identified(world: World) -> None:

@@ -12,6 +12,7 @@ from rosasync._actions.server_goal import ServerGoal
 from rosasync.typing import FeedbackT, GoalT
 
 if TYPE_CHECKING:
+    from rosasync._actions.feedback import FeedbackSender
     from rosasync._actions.goal_runner import GoalRunner
     from rosasync._actions.server_goals import ServerGoals
     from rosasync._server.service_call import ServiceCall
@@ -36,6 +37,7 @@ class GoalIntake:
         on_goal: the hook that decides; None to accept.
         goals: the states of the goals.
         runner: runs what is accepted.
+        feedback: publishes the feedback of what is accepted.
         now: returns the time of the node's clock, in ns.
         make_goal: makes what the handler gets, of a record and the goal's message.
 
@@ -51,6 +53,7 @@ class GoalIntake:
         on_goal: GoalHook[Any] | None,
         goals: ServerGoals,
         runner: GoalRunner,
+        feedback: FeedbackSender,
         now: Callable[[], int],
         make_goal: Callable[[GoalRecord, Any], ServerGoal[Any, Any]],
     ) -> None:
@@ -63,6 +66,7 @@ class GoalIntake:
         self._on_goal = on_goal
         self._goals = goals
         self._runner = runner
+        self._feedback = feedback
         self._now = now
         self._make_goal = make_goal
         # The ids of the goals that `on_goal` decides on.
@@ -113,6 +117,7 @@ class GoalIntake:
         call.respond(response)
         self.accepted += 1
         record = self._goals.accept(goal_id, stamp)
+        self._feedback.accept(goal_id, call)
         self._runner.add(self._make_goal(record, call.request.goal), record)
 
 

@@ -11,6 +11,7 @@ from copy import deepcopy
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Generic, Self, TypeAlias
 
+from rosasync._actions.feedback import FeedbackSender
 from rosasync._actions.goal_runner import (
     GoalErrorHook,
     GoalHandler,
@@ -82,6 +83,11 @@ class ActionServer(Generic[GoalT, ResultT, FeedbackT]):
         self._on_accepted = on_accepted
         self._tasks = HandlerTasks()
         self._traces = ServerTracing(tracing, ServiceKey(action.name, action.type_name))
+        self._feedback = FeedbackSender(
+            self._publish_feedback_message,
+            lambda: self._feedback_publisher,
+            graph_events=node.graph_events,
+        )
         self._goals = ServerGoals(
             action.name,
             GoalTable(
@@ -90,6 +96,7 @@ class ActionServer(Generic[GoalT, ResultT, FeedbackT]):
                 else check_seconds("result_timeout", result_timeout)
             ),
             self._publish_status,
+            self._feedback,
             action.action_type.Impl.GetResultService.Response,
         )
         self._runner = GoalRunner(
@@ -109,6 +116,7 @@ class ActionServer(Generic[GoalT, ResultT, FeedbackT]):
             check_hook("on_goal", on_goal, "request"),
             self._goals,
             self._runner,
+            self._feedback,
             node.now,
             self._make_goal,
         )
@@ -209,13 +217,15 @@ class ActionServer(Generic[GoalT, ResultT, FeedbackT]):
         """Exclude the calling handler from those that the end of the server waits for."""
         self._runner.exclude_caller()
 
-    def check_ports(self) -> None:
+    def on_graph(self) -> None:
         """End the server if something other than rosasync has destroyed one of its services.
 
-        For the session, whenever the graph changes. On the loop's thread.
+        Otherwise look again which clients its feedback reaches. For the session, whenever the graph
+        changes. On the loop's thread.
         """
         if not self._closing and any(service.closed for service in self._services):
             self.end(ContextShutdown)
+        self._feedback.on_graph()
 
     def end(self, ending: Callable[[], Exception]) -> None:
         """End at once; idempotent. Its goals have no end, and their handlers are cancelled.
@@ -232,7 +242,7 @@ class ActionServer(Generic[GoalT, ResultT, FeedbackT]):
 
     def _open(self, serve: ServeService) -> None:
         action, types = self._action, self._action.action_type.Impl
-        self._feedback = self._open_publisher(
+        self._feedback_publisher = self._open_publisher(
             types.FeedbackMessage, action.feedback_topic, TopicQos()
         )
         self._status = self._open_publisher(
@@ -278,16 +288,19 @@ class ActionServer(Generic[GoalT, ResultT, FeedbackT]):
         message.goal_id.uuid[:] = memoryview(goal_id)
         message.feedback = self._node.make_message(types.Feedback, value)
         if asyncio._get_running_loop() is self._loop:
-            self._send_feedback(message)
+            self._send_feedback(goal_id, message)
             return
         try:
-            self._loop.call_soon_threadsafe(self._send_feedback, deepcopy(message))
+            self._loop.call_soon_threadsafe(self._send_feedback, goal_id, deepcopy(message))
         except RuntimeError as error:
             raise SessionClosed(f"{self.action_name}: the event loop is closed") from error
 
-    def _send_feedback(self, message: Any) -> None:
+    def _send_feedback(self, goal_id: bytes, message: Any) -> None:
         self._feedback_count += 1
-        self._publish(self._feedback, message)
+        self._feedback.send(goal_id, message)
+
+    def _publish_feedback_message(self, message: Any) -> None:
+        self._publish(self._feedback_publisher, message)
 
     def _publish_status(self, message: bytes) -> None:
         self._publish(self._status, message)
@@ -316,6 +329,7 @@ class ActionServer(Generic[GoalT, ResultT, FeedbackT]):
             )
         self._runner.abort_all()
         self._goals.flush()
+        await self._feedback.wait()
         await self._goals.until_asked()
         # Each waits until the clients have received its last responses.
         await asyncio.gather(*(service.aclose(CLOSE_TIMEOUT) for service in self._services))
@@ -325,6 +339,7 @@ class ActionServer(Generic[GoalT, ResultT, FeedbackT]):
         self._ending = ending
         self._closing = True
         self._goals.close()
+        self._feedback.close()
         self._traces.close()
         for service in self._services:
             service.end(ending)

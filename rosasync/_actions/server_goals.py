@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import logging
 import math
 from collections.abc import Callable
@@ -16,6 +17,7 @@ from rosasync._status.wire import Outcome
 from rosasync.errors import ContextShutdown, SessionClosed
 
 if TYPE_CHECKING:
+    from rosasync._actions.feedback import FeedbackSender
     from rosasync._server.service_call import ServiceCall
 
 __all__ = ["ServerGoals"]
@@ -43,6 +45,7 @@ class ServerGoals:
         name: the action's name, for the log.
         table: the goals.
         publish_status: publishes the serialized status message.
+        feedback: publishes the feedback, which comes before the results.
         response_type: the class of the responses of ``get_result``.
     """
 
@@ -51,18 +54,21 @@ class ServerGoals:
         name: str,
         table: GoalTable,
         publish_status: Callable[[bytes], None],
+        feedback: FeedbackSender,
         response_type: type[Any],
     ) -> None:
         self._loop = asyncio.get_running_loop()
         self._name = name
         self._table = table
         self._publish_status = publish_status
+        self._feedback = feedback
         self._response_type = response_type
         self._statuses = StatusList()
         # Set while `_publish` is scheduled. One message serves all changes until then: it lists
         # every goal, and its subscribers keep the last message only.
         self._publishing: asyncio.Handle | None = None
-        # A goal is in `_askers` until it ends, and then in `_responses` until it expires.
+        # A goal is in `_askers` until its result is sent, and from its end until it expires in
+        # `_responses`.
         self._askers: dict[bytes, list[ServiceCall[Any, Any]]] = {}
         self._responses: dict[bytes, Any] = {}
         # The goals whose result no client has asked for yet, and when they were accepted.
@@ -127,8 +133,7 @@ class ServerGoals:
         response.status = int(record.status)
         response.result = result
         self._responses[record.id] = response
-        for call in self._askers.pop(record.id):
-            self._respond(call, response)
+        self._feedback.end(record.id, functools.partial(self._answer, record.id, response))
         self._arm()
         return True
 
@@ -199,6 +204,10 @@ class ServerGoals:
     def _publish(self) -> None:
         self._publishing = None
         self._publish_status(self._statuses.encode())
+
+    def _answer(self, goal_id: bytes, response: Any) -> None:
+        for call in self._askers.pop(goal_id):
+            self._respond(call, response)
 
     def _respond(self, call: ServiceCall[Any, Any], response: Any) -> None:
         # One that cannot be answered must not keep the others from it.

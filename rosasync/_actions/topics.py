@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Hashable, Iterable
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from rosasync._actions.status import GoalStatus, read_statuses, uuid_bytes, uuid_of
 from rosasync._core.ports import TopicQos
+from rosasync.errors import ContextShutdown
 
 if TYPE_CHECKING:
     from rosasync._actions.active_goal import ActiveGoal
@@ -47,6 +49,11 @@ class ActionTopics:
         self._find = find
         self._feedback: SubscriptionPort | None = None
         self._statuses: SubscriptionPort | None = None
+        # Whether the subscription to statuses has got a message, and who published the topic then.
+        self._has_status = False
+        self._heard: frozenset[Hashable] = frozenset()
+        # Whether it is going to get one, because one of them is still there.
+        self._expects_status = False
         # The newest message of the status topic that was not read, and the timer that reads it.
         self._unread_status: bytes | None = None
         self._timer: asyncio.TimerHandle | None = None
@@ -69,13 +76,26 @@ class ActionTopics:
                 self._on_status,
                 raw=True,
             )
+            self._has_status = False
+            self._expects_status = not self._heard.isdisjoint(self._find_publishers())
 
     def ready(self) -> bool:
-        """Return whether a server's feedback is matched; raises as `SubscriptionPort.publishers`.
+        """Return whether the feedback of a goal would arrive, as far as known.
 
-        The status topic need not be: it keeps its message for a late subscription.
+        The server has to be matched with the subscription, too, which the client cannot see. But it
+        learns of the subscriptions in their order, and the status topic keeps a message for a late
+        one. So the first status shows that the server is matched with the one to feedback. A server
+        that has had no goal yet sends none.
+
+        Raises:
+            PortDestroyed, ContextShutdown: as `SubscriptionPort.publishers`.
         """
-        return self._feedback is not None and self._feedback.publishers() > 0
+        if self._feedback is None or self._statuses is None or not self._feedback.publishers():
+            return False
+        if self._expects_status and not self._has_status:
+            self._statuses.drain()
+            return self._has_status
+        return True
 
     def drain_feedback(self) -> None:
         """Deliver the feedback that has arrived already."""
@@ -110,8 +130,15 @@ class ActionTopics:
         if goal is not None:
             goal.put_feedback(serialized)
 
+    def _find_publishers(self) -> frozenset[Hashable]:
+        return self._node.queries.find_publishers(self._action.status_topic)
+
     def _on_status(self, serialized: bytes) -> None:
         """Read a status message, at once or after a pause, in which a newer one may replace it."""
+        if not self._has_status:
+            self._has_status = True
+            with suppress(ContextShutdown):
+                self._heard = self._find_publishers()
         self._unread_status = serialized
         if self._timer is None:
             self._read_status()

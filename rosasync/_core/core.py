@@ -272,7 +272,7 @@ class Core:
         for server in tuple(self.servers):
             server.on_graph()
         for action_server in tuple(self.action_servers):
-            action_server.check_ports()
+            action_server.on_graph()
         try:
             self.actions.graph_changed()
         except ContextShutdown:

@@ -251,6 +251,22 @@ class PublisherPort(Protocol):
     def subscriptions(self) -> int:
         """Return how many subscriptions are matched; raises as `publish`."""
 
+    def reaches(self, client: Hashable) -> bool:
+        """Return whether a client's process has a subscription, and it is matched.
+
+        Args:
+            client: the identity of a client of some service; see `ServicePort.client_of`.
+
+        Raises:
+            PortDestroyed, ContextShutdown: as `publish`.
+        """
+
+    def acknowledged(self) -> bool:
+        """Return whether every matched subscription is known to have received every message.
+
+        True also if the middleware cannot tell. Raises as `publish`.
+        """
+
     def close(self) -> None:
         """Destroy the publisher; idempotent."""
 

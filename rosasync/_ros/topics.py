@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from functools import partial
 from typing import Any
 
+from rclpy.duration import Duration
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 from rclpy.qos import (
@@ -18,7 +19,8 @@ from rclpy.qos import (
 
 from rosasync._core.gateway import LoopGateway
 from rosasync._core.ports import DeliverMessage, TopicQos
-from rosasync._ros.failures import RclpyError, check_up, explain, is_destroyed
+from rosasync._ros.endpoints import GUID_PREFIX, compatible, prefixes
+from rosasync._ros.failures import RclpyError, check_up, explain, is_destroyed, uses_node
 from rosasync._ros.rcl import Rcl
 from rosasync._ros.signals import Signal, Signals
 from rosasync.errors import RosasyncError
@@ -55,6 +57,7 @@ class Publisher:
     def __init__(self, node: Node, publisher: Any, on_close: Callable[[Publisher], object]) -> None:
         self._node = node
         self._publisher = publisher
+        self._topic_name = publisher.topic_name
         self._on_close = on_close
         self._closed = False
 
@@ -71,6 +74,29 @@ class Publisher:
             return int(self._publisher.get_subscription_count())
         except RclpyError as error:
             raise explain(self._node, self._publisher.handle, error) from error
+
+    def reaches(self, client: Hashable) -> bool:
+        """Return whether a client's process has a subscription, and it is matched.
+
+        rclpy only counts those that are matched, so all that the graph shows have to be.
+        """
+        # First, so that none counts that is discovered during the query.
+        matched = self.subscriptions()
+        qos = self._publisher.qos_profile
+        with uses_node(self._node):
+            readers = self._node.get_subscriptions_info_by_topic(self._topic_name)
+            shown = [reader for reader in readers if compatible(qos, reader.qos_profile)]
+        process = client[:GUID_PREFIX] if isinstance(client, bytes) else None
+        return process in prefixes(shown) and matched >= len(shown)
+
+    def acknowledged(self) -> bool:
+        """Return whether every matched subscription is known to have received every message."""
+        try:
+            return bool(self._publisher.wait_for_all_acked(Duration()))
+        except RclpyError as error:
+            if is_destroyed(self._publisher.handle):
+                raise explain(self._node, self._publisher.handle, error) from error
+            return True
 
     def close(self) -> None:
         """Destroy the publisher; idempotent."""

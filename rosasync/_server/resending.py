@@ -87,6 +87,10 @@ class Resender:
             # If the task is cancelled before it begins, it cannot clear them itself.
             self._spawn(self._run(), self._unsent.clear)
 
+    def has(self, header: RequestHeader) -> bool:
+        """Return whether the response to a request waits to be sent again."""
+        return any(unsent.header is header for unsent in self._unsent)
+
     async def _run(self) -> None:
         try:
             while self._unsent:

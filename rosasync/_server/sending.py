@@ -6,7 +6,7 @@ import asyncio
 import logging
 import math
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from contextlib import suppress
 from copy import deepcopy
 from time import monotonic
@@ -84,6 +84,14 @@ class ResponseSender(Generic[ResponseT]):
         self._last_sent = -math.inf
         self._idle = threading.Condition(self.lock)
         self._sending = 0
+
+    def client_of(self, header: RequestHeader) -> Hashable:
+        """Return the identity of the client that sent a request; None if it is unknown."""
+        return self._port.client_of(header)
+
+    def is_waiting(self, header: RequestHeader) -> bool:
+        """Return whether the response to a request waits to be sent again."""
+        return self._resender.has(header)
 
     def check_open(self) -> None:
         """Raise the error for later responses, if there is one."""

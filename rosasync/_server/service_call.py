@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 from time import monotonic_ns
 from typing import TYPE_CHECKING, Any, Generic, Protocol
@@ -153,6 +153,20 @@ class ServiceCall(Generic[RequestT, ResponseT]):
     def responded(self) -> bool:
         """Whether it has been answered."""
         return self._outcome == _ANSWERED
+
+    @property
+    def sent(self) -> bool:
+        """Whether its response has been sent. Only on the loop's thread.
+
+        False after it was answered if the middleware has not discovered its client completely. Then
+        the response is sent again later.
+        """
+        return self.responded and not self._sender.is_waiting(self._header)
+
+    @property
+    def client(self) -> Hashable:
+        """What tells its client from others, in all processes; None if it is unknown."""
+        return self._sender.client_of(self._header)
 
     @property
     def settled(self) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
+from collections.abc import Hashable
 from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -64,6 +65,14 @@ class MemoryPublisher:
     def subscriptions(self) -> int:
         """Return how many subscriptions the topic has."""
         return len(self._matched())
+
+    def reaches(self, client: Hashable) -> bool:
+        """Return True: in memory, a subscription is matched as soon as it exists."""
+        return True
+
+    def acknowledged(self) -> bool:
+        """Return True: in memory, messages arrive in the order in which they were published."""
+        return True
 
     def close(self) -> None:
         """Leave the graph; idempotent."""
