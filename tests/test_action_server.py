@@ -766,7 +766,14 @@ async def test_bad_arguments(session: Session) -> None:
 
 
 async def test_a_type_by_its_name(session: Session, name: str) -> None:
-    async with session.serve_action("test_msgs/action/NestedMessage", name, at_once) as server:
+    async def handler(goal: AnyGoal) -> Any:
+        return {"nested_field": goal.request.nested_field}
+
+    async with session.serve_action("test_msgs/action/NestedMessage", name, handler) as server:
         assert server.action_type == "test_msgs/action/NestedMessage"
         assert server.action_name == name
+        async with Session("client", timeout=LIMIT) as client:
+            goal = {"nested_field": {"int32_value": 7}}
+            result = await client.act(NestedMessage, name, goal)
+            assert result.nested_field.int32_value == 7
     assert server.closed

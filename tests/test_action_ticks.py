@@ -1,10 +1,11 @@
-"""AsyncActionProxy, SendGoal and `session.from_thread.act`, with an action server in memory."""
+"""AsyncActionProxy, SendGoal and `session.from_thread.act`: in memory, and with stock servers."""
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
-from typing import Any
+from concurrent.futures import Future
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from py_trees.blackboard import Blackboard
@@ -25,9 +26,12 @@ from rosasync import (
     UsageError,
 )
 from rosasync.behaviours import SendGoal
-from tests.support.action_servers import ActionServerProcess
+from tests.support.action_servers import ActionServerProcess, none_runs
 from tests.support.fake_graph import FakeGraph
 from tests.support.times import LIMIT, TICK, until
+
+if TYPE_CHECKING:
+    from tests.conftest import Bridge
 
 State = ActionState
 
@@ -375,15 +379,96 @@ async def test_a_thread_that_gives_up_cancels_its_goal(session: Session, server:
     await until(lambda: server.cancelled == [7])
 
 
-async def test_with_a_stock_server(action_server: ActionServerProcess) -> None:
+# Stock servers.
+
+
+@pytest.fixture
+async def real(bridge: Bridge) -> AsyncIterator[Session]:
+    """A session on real ROS, on each bridge."""
+    async with Session("ticks", bridge=bridge, timeout=LIMIT) as session:
+        yield session
+
+
+async def test_a_proxy_with_a_stock_server(
+    real: Session, action_server: ActionServerProcess
+) -> None:
     await action_server.serve("/held", hold=True)
-    async with Session("ticks", timeout=LIMIT) as session:
-        proxy = AsyncActionProxy(session, Fibonacci, "/held")
-        proxy.send_goal({"order": 3})
-        await until(reaches(proxy, State.ACTIVE))
-        proxy.send_goal({"order": 2})
-        await until(reaches(proxy, State.ACTIVE))
-        await action_server.goals("/held", at_least=2)
-        await action_server.release("/held")
-        await until(reaches(proxy, State.SUCCEEDED))
-        assert list(proxy.get_result().sequence) == [0, 1]  # type: ignore[union-attr]
+    proxy = AsyncActionProxy(real, Fibonacci, "/held")
+    proxy.send_goal({"order": 3})
+    await until(reaches(proxy, State.ACTIVE))
+    proxy.send_goal({"order": 2})
+    await until(reaches(proxy, State.ACTIVE))
+    await action_server.goals("/held", at_least=2)
+    await action_server.release("/held")
+    await until(reaches(proxy, State.SUCCEEDED))
+    assert list(proxy.get_result().sequence) == [0, 1]  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("by", ["proxy", "leaf"])
+async def test_a_goal_that_a_stock_server_has_not_accepted_yet_is_cancelled(
+    real: Session, action_server: ActionServerProcess, by: str
+) -> None:
+    """Nobody waits for that: the proxy and the leaf go on at once."""
+    await action_server.serve("/slow", hold=True, idle=True, accept_delay=6 * TICK)
+    await real.wait_for_service(Fibonacci.Impl.SendGoalService, "/slow/_action/send_goal")
+    if by == "proxy":
+        proxy = AsyncActionProxy(real, Fibonacci, "/slow")
+        proxy.send_goal()
+        await action_server.asked("/slow")
+        proxy.cancel_goal()
+        assert proxy.get_state() is State.CANCELED
+    else:
+        tree = BehaviourTree(SendGoal("leaf", Fibonacci, "/slow"))
+        tree.setup(session=real)
+        tree.tick()
+        await action_server.asked("/slow")
+        tree.root.stop(Status.INVALID)
+        tree.shutdown()
+    await action_server.goals("/slow", at_least=1)
+    await none_runs(action_server, "/slow")
+
+
+async def test_a_leaf_with_a_stock_server(
+    real: Session, action_server: ActionServerProcess
+) -> None:
+    await action_server.serve("/held", hold=True, feedback=2, readers=1)
+    leaf = SendGoal("count", Fibonacci, "/held", {"order": 2}, key_result="result")
+    tree = BehaviourTree(leaf)
+    tree.setup(session=real)
+    tree.tick()
+    await until(lambda: leaf.proxy.get_feedback())
+    await action_server.release("/held")
+    assert await run(tree) is Status.SUCCESS
+    assert list(Blackboard.get("result").sequence) == [0, 1]
+    tree.shutdown()
+
+
+async def test_a_thread_with_a_stock_server(
+    real: Session, action_server: ActionServerProcess
+) -> None:
+    act = real.from_thread.act
+    await action_server.serve("/fibonacci")
+    result = await asyncio.to_thread(act, Fibonacci, "/fibonacci", {"order": 3})
+    assert list(result.sequence) == [0, 1, 2]
+    await action_server.serve("/held", hold=True)
+    async with real.goal(Fibonacci, "/held"):
+        pass
+    goal = asyncio.create_task(asyncio.to_thread(act, Fibonacci, "/held", timeout=20 * TICK))
+    await action_server.goals("/held", at_least=2)
+    with pytest.raises(GoalTimeout):
+        await goal
+    await none_runs(action_server, "/held")
+
+
+async def test_on_the_executors_thread(real: Session) -> None:
+    outcome: Future[Any] = Future()
+
+    def callback() -> None:
+        try:
+            real.from_thread.act(Fibonacci, "/fibonacci")
+        except BaseException as error:
+            outcome.set_exception(error)
+
+    real.node.executor.create_task(callback)
+    with pytest.raises(UsageError, match="executor"):
+        await asyncio.wrap_future(outcome)

@@ -57,6 +57,21 @@ async def test_a_goal_is_one_call(fake_graph: FakeGraph) -> None:
     }
 
 
+async def test_the_spans_of_goals_that_do_not_succeed(fake_graph: FakeGraph) -> None:
+    server = await serve(fake_graph)
+    provider, spans = TracerProvider(), InMemorySpanExporter()
+    provider.add_span_processor(SimpleSpanProcessor(spans))
+    async with fake_graph.session(trace=OpenTelemetryTrace(provider)) as session:
+        with pytest.raises(GoalAborted):
+            await session.act(Fibonacci, "/fibonacci", {"order": -1})
+        async with session.goal(Fibonacci, "/fibonacci", {"order": 1}) as goal:
+            await goal.cancel()
+    await server.aclose()
+    aborted, cancelled = spans.get_finished_spans()
+    assert not aborted.status.is_ok
+    assert [event.name for event in cancelled.events] == ["sent", "accepted", "canceling"]
+
+
 @pytest.mark.parametrize("action_calls", [False, True])
 async def test_its_services_have_spans_if_asked_for(
     fake_graph: FakeGraph, action_calls: bool

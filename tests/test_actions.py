@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any, Literal
 from uuid import uuid4
 
 import pytest
@@ -24,21 +25,12 @@ from rosasync import (
     UsageError,
 )
 from rosasync._actions import server_watch
-from tests.support.action_servers import ActionServerProcess
+from tests.support.action_servers import ActionServerProcess, none_runs
 from tests.support.nodes import borrowed_node
 from tests.support.times import LIMIT, TICK, until
 
 if TYPE_CHECKING:
     from tests.conftest import Bridge
-
-
-async def none_runs(server: ActionServerProcess, name: str) -> None:
-    """Wait until the server has no goal that runs."""
-    for _ in range(100):
-        if not await server.running(name):
-            return
-        await asyncio.sleep(LIMIT / 100)
-    raise AssertionError(f"{await server.running(name)} still run")
 
 
 async def test_a_goal_gives_its_result(
@@ -119,6 +111,63 @@ async def test_cancel_returns_when_the_server_has_agreed(
         assert list(caught.value.result.sequence) == [0]
         await goal.cancel()
     assert await action_server.goals("/held") == {goal.id: GoalStatus.CANCELED}
+
+
+@pytest.mark.parametrize("end", ["succeed", "abort"])
+async def test_a_goal_that_is_being_cancelled_may_end_otherwise(
+    session: Session, action_server: ActionServerProcess, end: Literal["succeed", "abort"]
+) -> None:
+    await action_server.serve("/held", hold=True, canceled=end)
+    async with session.goal(Fibonacci, "/held") as goal:
+        await goal.cancel()
+        if end == "succeed":
+            assert list((await goal.result()).sequence) == [0]
+        else:
+            with pytest.raises(GoalAborted):
+                await goal.result()
+        assert goal.status is (GoalStatus.SUCCEEDED if end == "succeed" else GoalStatus.ABORTED)
+    assert await action_server.goals("/held") == {goal.id: goal.status}
+
+
+async def test_a_cancellation_that_is_not_answered_in_time(
+    session: Session, action_server: ActionServerProcess
+) -> None:
+    await action_server.serve("/held", hold=True)
+    async with session.goal(Fibonacci, "/held", cancel_timeout=LIMIT) as goal:
+        with pytest.raises(GoalTimeout, match="the cancellation was not answered within"):
+            await goal.cancel(timeout=0)
+        assert await action_server.running("/held") == [goal.id]
+        await goal.cancel(timeout=LIMIT)
+
+
+async def test_an_error_of_on_feedback_passes_on_and_cancels_the_goal(
+    session: Session, action_server: ActionServerProcess
+) -> None:
+    await action_server.serve("/held", hold=True, feedback=5, readers=1)
+
+    async def fails(feedback: Fibonacci.Feedback) -> None:
+        raise ZeroDivisionError(feedback.sequence[0])
+
+    with pytest.raises(ZeroDivisionError, match="^0$"):
+        await session.act(Fibonacci, "/held", on_feedback=fails)
+    await none_runs(action_server, "/held")
+
+
+async def test_a_server_that_keeps_no_results(
+    session: Session, action_server: ActionServerProcess
+) -> None:
+    """The result is asked for before its end, so it arrives nevertheless."""
+    await action_server.serve("/forgetful", hold=True, result_timeout=0)
+    async with session.goal(Fibonacci, "/forgetful", {"order": 2}) as goal:
+        await action_server.release("/forgetful")
+        assert list((await goal.result()).sequence) == [0, 1]
+    async with asyncio.timeout(LIMIT):
+        while True:
+            async with session.attach(Fibonacci, "/forgetful", goal.id) as late:
+                with suppress(GoalRejected):
+                    await late.result()
+                    continue
+            break
 
 
 async def test_a_server_that_refuses_to_cancel(

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 import signal
 import subprocess
 import sys
 import uuid
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ import pytest
 import yaml
 
 from tests.support.action_clients import ActionClientProcess, Ended
+from tests.support.action_servers import ActionServerProcess, none_runs
 from tests.support.command import LIMIT, json_lines, rosasync, terminal
 from tests.support.process import ROOT, ended
 
@@ -40,6 +43,19 @@ def slow() -> Iterator[None]:
     with terminal("action", "serve", SLOW, FIBONACCI, "--delay", "1000") as server:
         server.wait_for("Ctrl-C ends it")
         yield
+
+
+def sent(name: str) -> AbstractContextManager[subprocess.Popen[str]]:
+    """A command that sends a goal, which is ended with the block."""
+    command = (sys.executable, "-m", "rosasync", "action", "send", name)
+    pipe = subprocess.PIPE
+    return ended(subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, cwd=ROOT))
+
+
+def wait_for_acceptance(process: subprocess.Popen[str]) -> None:
+    assert process.stderr is not None
+    while "accepted" not in (line := process.stderr.readline()):
+        assert line
 
 
 @pytest.fixture
@@ -93,11 +109,23 @@ class TestSend:
         assert line == {"status": "SUCCEEDED", "result": {"sequence": [0, 1]}}
 
     def test_feedback(self) -> None:
-        done = rosasync("action", "send", QUICK, "--feedback")
-        *feedback, result = yaml.safe_load_all(done.stdout)
-        # It may be quicker than the middleware finds the subscription.
-        assert all(each == {"feedback": {"sequence": [0]}} for each in feedback)
-        assert result == {"result": {"sequence": [0, 1]}}
+        # It may be quicker than the middleware finds the subscription of a new client, so late.
+        options = ("--delay", "0.5", "--feedback", "sequence: [0]", "--feedback", "sequence: [1]")
+        with terminal("action", "serve", "/cli/late", FIBONACCI, *options) as server:
+            server.wait_for("Ctrl-C ends it")
+            done = rosasync("action", "send", "/cli/late", "--feedback")
+            assert list(yaml.safe_load_all(done.stdout)) == [
+                {"feedback": {"sequence": [0]}},
+                {"feedback": {"sequence": [1]}},
+                {"result": {"sequence": []}},
+            ]
+            done = rosasync("action", "send", "/cli/late", "--feedback", "--json")
+            *feedback, end = json_lines(done.stdout)
+            assert feedback == [{"feedback": {"sequence": [0]}}, {"feedback": {"sequence": [1]}}]
+            assert (end["status"], end["result"]) == ("SUCCEEDED", {"sequence": []})
+            # Without the option, only the result.
+            done = rosasync("action", "send", "/cli/late")
+            assert yaml.safe_load(done.stdout) == {"sequence": []}
 
     def test_a_template(self) -> None:
         done = rosasync("action", "send", QUICK, "--template")
@@ -145,20 +173,41 @@ def test_goals_that_are_rejected_and_aborted() -> None:
 class TestCancelling:
     @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
     def test_a_signal_cancels_the_goal(self, number: signal.Signals) -> None:
-        command = (sys.executable, "-m", "rosasync", "action", "send", SLOW)
-        with ended(
-            subprocess.Popen(
-                command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT
-            )
-        ) as process:
-            assert process.stderr is not None
-            while "accepted" not in (line := process.stderr.readline()):
-                assert line
+        with sent(SLOW) as process:
+            wait_for_acceptance(process)
             process.send_signal(number)
             output, errors = process.communicate(timeout=LIMIT)
         assert (process.returncode, output) == (128 + number, "")
         assert "the goal has ended: CANCELED" in errors
         assert "Traceback" not in errors
+
+    def test_a_signal_while_the_server_refuses(self, action_server: ActionServerProcess) -> None:
+        action_server.serve_now("/cli/stubborn", hold=True, cancel=False)
+        with terminal("action", "send", "/cli/stubborn") as sending:
+            sending.wait_for("accepted")
+            sending.interrupt()
+            assert sending.end() == 130
+        assert "the server refuses to cancel the goal, which runs on" in sending.screen
+        assert "Traceback" not in sending.screen
+
+    def test_a_signal_before_the_acceptance(self, action_server: ActionServerProcess) -> None:
+        action_server.serve_now("/cli/late", hold=True, idle=True, accept_delay=1.0)
+        with sent("/cli/late") as process:
+            asyncio.run(action_server.asked("/cli/late"))
+            process.send_signal(signal.SIGINT)
+            output, errors = process.communicate(timeout=LIMIT)
+        assert (process.returncode, output) == (130, "")
+        assert "interrupted before the goal was accepted" in errors
+        asyncio.run(none_runs(action_server, "/cli/late"))
+
+    def test_the_server_vanishes_with_the_goal(self, action_server: ActionServerProcess) -> None:
+        action_server.serve_now("/cli/mortal", hold=True)
+        with sent("/cli/mortal") as process:
+            wait_for_acceptance(process)
+            asyncio.run(action_server.stop("/cli/mortal"))
+            output, errors = process.communicate(timeout=LIMIT)
+        assert (process.returncode, output) == (5, "")
+        assert "every server vanished before the goal ended" in errors
 
     def test_the_deadline_cancels_the_goal(self) -> None:
         done = rosasync("action", "send", SLOW, FIBONACCI, "--timeout", "6")

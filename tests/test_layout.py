@@ -37,6 +37,17 @@ def test_only_ros_imports_rclpy() -> None:
     assert not offenders
 
 
+def test_actions_are_not_those_of_rclpy() -> None:
+    # Its client in Jazzy's packages loses goals: see docs/faq.md.
+    offenders = [
+        f"{name}:{statement.lineno}"
+        for name, file in FILES.items()
+        for statement in _imports(ast.parse(file.read_text()), typing=True)
+        if any(found.startswith("rclpy.action") for found in _names(statement))
+    ]
+    assert not offenders
+
+
 @pytest.mark.parametrize("room", INNER)
 def test_the_inside_imports_no_user_of_the_public_api(room: str) -> None:
     above = ("rosasync._cli.", "rosasync._demo.", "rosasync.testing.", "rosasync.behaviours")

@@ -21,7 +21,7 @@ from rosasync import (
     Session,
 )
 from rosasync.testing import Graph, VirtualClock
-from tests.support.times import LIMIT, until
+from tests.support.times import LIMIT, TICK, until
 
 pytestmark = pytest.mark.parametrize("ros_graph", ["memory", "real"], indirect=True)
 
@@ -154,6 +154,36 @@ async def test_a_server_that_vanishes_with_goals_out(ros_graph: Graph, session: 
     await stub.wait_for_goals(2)
     task.cancel()
     await until(lambda: stub.goals[1].status is S.CANCELED)
+
+
+async def test_faults_hold_in_their_block(ros_graph: Graph, session: Session) -> None:
+    stub = ros_graph.stub_action(Fibonacci, DRIVE)
+    stub.answer(None, match={"order": 9}).answer(sequence(1))
+    unanswered = "the cancellation was not answered within"
+    async with session.goal(Fibonacci, DRIVE, {"order": 9}) as goal:
+        with stub.drop_requests(), pytest.raises(GoalTimeout, match=unanswered):
+            await goal.cancel(timeout=2 * TICK)
+        assert stub.lost_requests >= 1
+        stub.assert_statuses(S.EXECUTING)
+        with stub.delay_responses(8 * TICK), pytest.raises(GoalTimeout, match=unanswered):
+            await goal.cancel(timeout=2 * TICK)
+        await until(lambda: stub.goals[0].status is S.CANCELED)
+    with stub.drop_results():
+        async with session.goal(Fibonacci, DRIVE, {"order": 4}) as goal:
+            await until(lambda: stub.goals[-1].status is S.SUCCEEDED)
+            with pytest.raises(GoalTimeout, match="has not ended within"):
+                await goal.result(timeout=4 * TICK)
+    assert await drive(session, 5) == [1]
+    stub.assert_goals({"order": 9}, {"order": 4}, {"order": 5})
+
+
+async def test_an_acceptance_that_is_lost(ros_graph: Graph, session: Session) -> None:
+    """The status topic shows it, and the goal goes on without it."""
+    stub = ros_graph.stub_action(Fibonacci, DRIVE, sequence(1))
+    assert await drive(session, 1) == [1]
+    with stub.drop_responses():
+        assert await drive(session, 2) == [1]
+    stub.assert_statuses(S.SUCCEEDED, S.SUCCEEDED)
 
 
 async def test_a_handler(ros_graph: Graph, session: Session) -> None:

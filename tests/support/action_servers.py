@@ -20,7 +20,7 @@ from tests.support.executor import run_in
 from tests.support.process import NodeProcess
 from tests.support.times import LIMIT
 
-__all__ = ["FIBONACCI", "ActionServerProcess", "End"]
+__all__ = ["FIBONACCI", "ActionServerProcess", "End", "none_runs"]
 
 FIBONACCI = "test_msgs/action/Fibonacci"
 
@@ -48,10 +48,12 @@ class ActionServerProcess(NodeProcess):
         end: End = "succeed",
         hold: bool = False,
         feedback: int = 0,
+        readers: int = 0,
         rate: float = 0.0,
         accept: bool = True,
         accept_delay: float = 0.0,
         cancel: bool = True,
+        canceled: End | Literal["canceled"] = "canceled",
         result_timeout: int = 900,
         ignored_asks: int = 0,
         idle: bool = False,
@@ -64,10 +66,12 @@ class ActionServerProcess(NodeProcess):
             end: how its goals end.
             hold: whether a goal runs until `release` is called, or until it is cancelled.
             feedback: how many feedback messages a goal publishes first.
+            readers: how many subscriptions to its feedback have to be discovered before that.
             rate: how many of them in a second; 0 for as many as it can.
             accept: whether it accepts goals.
             accept_delay: seconds before it answers to a goal.
             cancel: whether it agrees to cancel goals.
+            canceled: how a goal ends that is cancelled.
             result_timeout: seconds for which it keeps results.
             ignored_asks: how many requests for a result it ignores at first.
             idle: whether a held goal takes no thread of the executor, so that hundreds may run.
@@ -78,10 +82,12 @@ class ActionServerProcess(NodeProcess):
             "end": end,
             "hold": hold,
             "feedback": feedback,
+            "readers": readers,
             "rate": rate,
             "accept": accept,
             "accept_delay": accept_delay,
             "cancel": cancel,
+            "canceled": canceled,
             "result_timeout": result_timeout,
             "ignored_asks": ignored_asks,
             "idle": idle,
@@ -101,6 +107,10 @@ class ActionServerProcess(NodeProcess):
         goals: dict[str, int] = await self.ask("goals", name=name, at_least=at_least)
         return {UUID(key): status for key, status in goals.items()}
 
+    async def asked(self, name: str) -> None:
+        """Wait until a goal has come to the server, which it may not have accepted yet."""
+        await self.ask("asked", name=name)
+
     async def running(self, name: str) -> list[UUID]:
         """Return the goals that have not ended."""
         return [key for key, status in (await self.goals(name)).items() if status < 4]
@@ -117,6 +127,15 @@ class ActionServerProcess(NodeProcess):
         self.ask_now("clear", patience=LIMIT)
 
 
+async def none_runs(server: ActionServerProcess, name: str) -> None:
+    """Wait until the server has no goal that runs."""
+    for _ in range(100):
+        if not await server.running(name):
+            return
+        await asyncio.sleep(LIMIT / 100)
+    raise AssertionError(f"{await server.running(name)} still run")
+
+
 class _Server:
     """One action server of the process, and the goals it has accepted."""
 
@@ -126,8 +145,10 @@ class _Server:
 
         from rosasync._ros.types import action_type
 
+        self._node = node
         self.options = options
         self.type = action_type(options["action_type"])
+        self.asked = threading.Event()
         self.released = threading.Event()
         self.goals: dict[str, Any] = {}
         self.accepted = threading.Condition()
@@ -171,6 +192,7 @@ class _Server:
             goal.execute()
 
     def _on_goal(self, goal: Any) -> Any:
+        self.asked.set()
         time.sleep(self.options["accept_delay"])
         return self._accept
 
@@ -193,21 +215,29 @@ class _Server:
 
     def _execute(self, goal: Any) -> Any:
         options = self.options
+        topic = f"{options['name']}/_action/feedback"
+        while self._node.count_subscribers(topic) < options["readers"]:
+            # Matched is what is discovered a moment later.
+            time.sleep(0.02)
         for number in range(options["feedback"]):
             self._publish(goal, number)
             if options["rate"]:
                 time.sleep(1 / options["rate"])
         while options["hold"] and not self.released.wait(0.01):
             if goal.is_cancel_requested:
-                goal.canceled()
-                return self._result(goal, 1)
-        if options["end"] == "succeed":
+                return self._end(goal, options["canceled"], 1)
+        return self._end(goal, options["end"], getattr(goal.request, "order", 0))
+
+    def _end(self, goal: Any, end: str, order: int) -> Any:
+        if end == "succeed":
             goal.succeed()
-        elif options["end"] == "abort":
+        elif end == "abort":
             goal.abort()
-        elif options["end"] == "raise":
+        elif end == "canceled":
+            goal.canceled()
+        elif end == "raise":
             raise RuntimeError("the goal fails")
-        return self._result(goal, getattr(goal.request, "order", 0))
+        return self._result(goal, order)
 
     def _publish(self, goal: Any, number: int) -> None:
         feedback = self.type.Feedback()
@@ -243,6 +273,9 @@ class _Servers:
 
     def release(self, name: str) -> None:
         self._servers[name].released.set()
+
+    def asked(self, name: str) -> None:
+        assert self._servers[name].asked.wait(LIMIT), "no goal has come"
 
     def goals(self, name: str, at_least: int) -> dict[str, int]:
         server = self._servers[name]
