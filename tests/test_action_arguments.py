@@ -204,6 +204,11 @@ async def test_an_id_that_is_none(session: Session, given: Any) -> None:
         session.attach(Fibonacci, NAME, given)
 
 
+async def test_the_id_that_stands_for_every_goal(session: Session) -> None:
+    with pytest.raises(ValueError, match="goal_id has only zeros"):
+        session.attach(Fibonacci, NAME, uuid.UUID(int=0))
+
+
 async def test_hooks_of_a_server_take_their_arguments(session: Session) -> None:
     serve: Any = session.serve_action
 

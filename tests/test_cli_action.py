@@ -237,12 +237,25 @@ class TestCancelling:
 
 
 @pytest.mark.parametrize(
-    "arguments", [(), ("--all", "--id", uuid.uuid4().hex), ("--id", "nonsense")]
+    "arguments",
+    [
+        (),
+        ("--all", "--id", uuid.uuid4().hex),
+        ("--id", "nonsense"),
+        # It would cancel all.
+        ("--id", "0" * 32),
+    ],
 )
 def test_what_to_cancel_has_to_be_said(arguments: tuple[str, ...]) -> None:
     done = rosasync("action", "cancel", SLOW, *arguments)
     assert (done.returncode, done.stdout) == (2, "")
     assert "--id" in done.stderr
+
+
+def test_a_bad_name_is_one_of_an_action() -> None:
+    done = rosasync("action", "type", "/a b")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "'/a b' is not a valid action name" in done.stderr
 
 
 def test_no_server_to_cancel_at() -> None:
@@ -289,7 +302,9 @@ class TestServe:
         ("options", "text"),
         [
             (("--on-busy", "wait"), "'queue', 'reject' or 'replace'"),
-            (("--handler", "nonsense"), "Expected MODULE:FUNCTION"),
+            (("--handler", "nonsense:drive"), "Expected MODULE:FUNCTION"),
+            # It would print a poem.
+            (("--handler", "this"), "Expected MODULE:FUNCTION"),
             (("--handler", "os.path:join"), "must be async"),
             (("--handler", "os.path:join", "--delay", "1"), "leave out the options of the stub"),
             (("--result", "{sequenze: []}"), "sequenze"),

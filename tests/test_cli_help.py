@@ -59,6 +59,9 @@ def test_without_arguments_it_prints_the_help() -> None:
         (("call",), "--help"),
         (("list", "--nonsense"), "--help"),
         (("call", "/lamp/switch", "std_srvs/srv/SetBool", "data:", "true"), "needs quotes"),
+        (("call", "/lamp/switch", "data:", "true"), "needs quotes"),
+        (("action", "send", "/drive", "order:", "5"), "needs quotes"),
+        (("action", "send", "/drive", "{order: 5}", "test_msgs/action/Fibonacci"), "comes last"),
         (("list", "data:"), "--help"),
     ],
 )

@@ -130,7 +130,8 @@ def test_unknown_name_says_what_is_there(name: str, message: str) -> None:
     ("given_type", "error", "message"),
     [
         ("test_msgs/action/Quux", ValueError, "no such action in test_msgs; it has Fibonacci, "),
-        ("test_msgs/srv/Fibonacci", ValueError, "expected 'package/action/Type', such as"),
+        ("test_msgs/srv/Fibonacci", ValueError, "expected 'package/action/Type', such as .*"),
+        ("std_srvs/srv/SetBool", ValueError, "; it is a service, for session.call and session.se"),
         ("std_srvs/action/SetBool", ValueError, "the package 'std_srvs' has no actions"),
         (SetBool, TypeError, "std_srvs/srv/SetBool is not an action: it has no Goal, Result and"),
         (SetBool, TypeError, "it is a service, for session.call and session.serve$"),

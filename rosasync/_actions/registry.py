@@ -199,6 +199,9 @@ class Actions:
         if not isinstance(goal_id, UUID):
             hint = "such as goal.id, or uuid.UUID(text)"
             raise TypeError(f"goal_id must be a uuid.UUID, {hint}, not {type(goal_id).__name__}")
+        if not goal_id.int:
+            # In a request to cancel, it stands for every goal of the server.
+            raise ValueError("goal_id has only zeros: that is no goal's id")
         arguments = self.arguments(action_type, action_name, None, accept_timeout, wait)
         block = self._follow(arguments, goal_id, check_count("feedback", feedback, 1))
         return GoalBlock(block, "session.attach")

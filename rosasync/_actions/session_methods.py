@@ -320,6 +320,7 @@ class ActionMethods:
 
         Raises:
             TypeError: ``goal_id`` is not a ``uuid.UUID``.
+            ValueError: ``goal_id`` has only zeros.
             Exception: entering raises as `act` if there is no server. If the server does not know
                 the goal, ``goal.result()`` raises `GoalRejected`.
         """

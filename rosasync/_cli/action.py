@@ -125,7 +125,7 @@ def info(name: ActionName, as_json: AsJson = False, wait: Wait = None) -> None:
 
 async def _info(name: str, as_json: bool, wait: float | None) -> int:
     async with open_session() as session:
-        resolved = resolve(session, name)
+        resolved = resolve(session, name, "action")
         await settle(session, wait)
         servers, clients = endpoints_of(session, resolved)
         if not servers:
@@ -213,12 +213,17 @@ def _parsed_id(goal_id: str | None, every: bool) -> UUID:
     """Return the id of the goal to cancel; zero for all."""
     if (goal_id is None) is not every:
         raise CliError("give either --id ID, for one goal, or --all")
+    if goal_id is None:
+        return UUID(int=0)
     try:
-        return UUID(int=0) if goal_id is None else UUID(goal_id)
+        found = UUID(goal_id)
     except ValueError:
         raise CliError(
             f"--id {goal_id}: not the id of a goal, which has 32 hexadecimal digits"
         ) from None
+    if not found.int:
+        raise CliError("--id has only zeros, which stands for all goals: use --all to cancel them")
+    return found
 
 
 async def _cancel(

@@ -68,7 +68,7 @@ async def wait_for_types(session: rosasync.Session, name: str, timeout: float) -
     """Wait until the graph shows a server of an action; return the types, none after a timeout."""
     from rosasync._ros.inspect import action_types
 
-    resolved = resolve(session, name)
+    resolved = resolve(session, name, "action")
     end = time.monotonic() + timeout
     while not (types := action_types(session.node, resolved)):
         if time.monotonic() >= end:
@@ -122,7 +122,7 @@ def meant_instead(session: rosasync.Session, name: str) -> str:
     from rosasync._ros.graph import describe_similar
     from rosasync._ros.inspect import served_types
 
-    resolved = resolve(session, name)
+    resolved = resolve(session, name, "action")
     if served_types(session.node, resolved):
         return f"; it is a service. Try: rosasync info {name}"
     similar = describe_similar(actions_of(session), resolved)

@@ -133,15 +133,15 @@ def explain_type(name: str, error: ValueError) -> str:
     )
 
 
-def resolve(session: rosasync.Session, name: str) -> str:
-    """Return the full name of a service.
+def resolve(session: rosasync.Session, name: str, kind: str = "service") -> str:
+    """Return the full name of a service, or of an action.
 
     Raises:
         rosasync.InvalidServiceName: ROS does not allow the name.
     """
     from rosasync._ros.names import resolve_name
 
-    return resolve_name(session.node, name)
+    return resolve_name(session.node, name, kind)
 
 
 def is_hidden(name: str) -> bool:

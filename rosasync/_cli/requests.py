@@ -30,10 +30,13 @@ def split_type(srv_type: str | None, text: str | None) -> tuple[str | None, str 
     """Tell the type from the request where only one of the two was given.
 
     Raises:
-        typer.BadParameter: it is the name, which comes first.
+        typer.BadParameter: it is the name, which comes first, or the request, which comes last.
     """
     if srv_type is not None and re.fullmatch(r"(/\w+)+", srv_type):
         raise typer.BadParameter(f"{srv_type!r} is a name: give the name first, and then the type")
+    if text is not None and srv_type is not None and re.search(r"[{}:]", srv_type):
+        quoted = join(f"{srv_type!r} is YAML, which comes last", "With spaces it needs quotes")
+        raise typer.BadParameter(f"{quoted}: '{{data: true}}'")
     if text is None and srv_type is not None and not re.fullmatch(r"[\w]+(/\w+)+", srv_type):
         return None, srv_type
     return srv_type, text

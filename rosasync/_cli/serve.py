@@ -155,7 +155,10 @@ def load_handler(handler: str) -> Any:
     Raises:
         CliError: there is no such function.
     """
-    module, _, function = handler.partition(":")
+    module, colon, function = handler.partition(":")
+    if not colon:
+        # Before the import, which runs the module.
+        raise CliError(f"--handler {handler}: Expected MODULE:FUNCTION, such as drives:drive")
     sys.path.insert(0, os.getcwd())
     try:
         found = getattr(importlib.import_module(module), function)

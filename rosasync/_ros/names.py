@@ -89,14 +89,14 @@ def default_qos(depth: int = DEPTH) -> QoSProfile:
     return qos
 
 
-def resolve_name(node: Node, srv_name: str) -> str:
-    """Return the expanded and remapped name of a service.
+def resolve_name(node: Node, srv_name: str, kind: str = "service") -> str:
+    """Return the expanded and remapped name of a service, or of another ``kind``.
 
     Raises:
         InvalidServiceName: ROS does not allow the name.
         TypeError: not a str.
     """
-    name = expand_name(node, srv_name, "service")
+    name = expand_name(node, srv_name, kind)
     with uses_node(node):
         return str(node.resolve_service_name(name))
 

@@ -167,6 +167,9 @@ def _meant(kind: _Kind, name: str) -> str:
     """Return the end of an error about a malformed name of a type: what was probably meant."""
     if name.startswith(("/", "~")):
         return "; the type comes before the name"
+    for other in (_SERVICE, _ACTION):
+        if other is not kind and re.fullmatch(rf"\w+/{other.folder}/\w+", name):
+            return f"; it is {other.a}, for {other.uses}"
     match = re.fullmatch(rf"([a-z]\w*)[/.](?:{kind.folder}[/.])?([A-Z]\w*)", name, re.ASCII)
     return f"; did you mean '{match[1]}/{kind.folder}/{match[2]}'?" if match else ""
 
