@@ -19,6 +19,7 @@ from rosasync import (
     ServerGone,
     ServiceUnavailable,
     Session,
+    UsageError,
 )
 from rosasync.testing import Graph, VirtualClock
 from tests.support.times import LIMIT, TICK, until
@@ -234,3 +235,25 @@ async def test_bad_arguments(ros_graph: Graph) -> None:
         stub.answer(sequence(), match={"ordre": 2})
     with pytest.raises(ValueError, match="sequenze"):
         stub.answer(GoalAborted("x", result={"sequenze": []}))
+    for single in (sequence(1), Fibonacci.Feedback()):
+        with pytest.raises(TypeError, match="feedback must be a list of messages or mappings"):
+            stub.answer(sequence(), feedback=single)
+    wrong: Any = 3
+    with pytest.raises(TypeError, match="match must be a mapping of fields, a function or None"):
+        stub.answer(sequence(), match=wrong)
+    with pytest.raises(TypeError, match="not list: give each as an argument of its own"):
+        stub.assert_goals([{"order": 1}])  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="seconds must be a number of seconds, not str"):
+        stub.delay_responses("1")  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="number must be a whole number, not str"):
+        await stub.wait_for_goals("1")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="at least one answer"):
+        ros_graph.stub_action(Fibonacci, "/feedback", feedback=[sequence(1)], optional=True)
+    with pytest.raises(TypeError, match="on_cancel must be callable"):
+        ros_graph.stub_action(Fibonacci, "/on_cancel", None, on_cancel=wrong, optional=True)
+
+    async def handler(goal: Any) -> Any: ...
+
+    drives = ros_graph.serve_action(Fibonacci, "/handler", handler, optional=True)
+    with pytest.raises(UsageError, match="/handler: its handler answers: use stub_action"):
+        drives.answer(sequence())

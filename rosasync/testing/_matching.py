@@ -78,9 +78,16 @@ def explain_mismatch(
         Their difference; None if they match.
 
     Raises:
+        TypeError: something other than a mapping is expected.
         ValueError: the message type has no field that is expected.
     """
     for fields in expected:
+        if not isinstance(fields, Mapping):
+            kind = type(fields).__name__
+            raise TypeError(
+                f"expected a mapping of fields for each {type_name(message_type)}, "
+                f"not {kind}: give each as an argument of its own"
+            )
         check_fields(message_type, fields)
     if len(expected) == len(requests) and all(map(matches, expected, requests)):
         return None

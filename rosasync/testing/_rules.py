@@ -59,12 +59,16 @@ class Rules(Generic[AnswerT]):
         """Check the arguments of a rule before its answers are prepared.
 
         Raises:
+            TypeError: ``match`` is neither a mapping nor a function.
             ValueError: there is no answer, or the request has no such field.
         """
         if not answers:
             raise ValueError(f"{name}: answer() takes at least one answer")
         if isinstance(match, Mapping):
             check_fields(self._request_type, match)
+        elif match is not None and not callable(match):
+            kind = type(match).__name__
+            raise TypeError(f"match must be a mapping of fields, a function or None, not {kind}")
 
     def add(self, match: Match[Any], answers: list[AnswerT]) -> None:
         """Add a rule behind the others."""

@@ -314,7 +314,7 @@ class Graph:
             UsageError: the graph is not open, or this runs outside its loop.
         """
         server = self._serve_action(action_type, action_name, STUB_ACTION, optional, options)
-        if answers:
+        if answers or feedback or delay:
             server.answer(*answers, feedback=feedback, delay=delay)
         return server
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Generic, Self, TypeAlias
 from rosasync._core.text import count
 from rosasync._ros.messages import to_dict, to_message
 from rosasync._ros.types import service_type
+from rosasync.options import check_seconds
 from rosasync.testing._arrivals import Arrivals
 from rosasync.testing._faults import Faults, FaultyService, StubCall, set_in_block
 from rosasync.testing._matching import (
@@ -145,7 +146,7 @@ class StubServer(Generic[RequestT, ResponseT]):
 
     def delay_responses(self, seconds: float) -> AbstractContextManager[None]:
         """Delay responses by a number of seconds, in this block."""
-        return set_in_block(self._faults, "delay", seconds)
+        return set_in_block(self._faults, "delay", check_seconds("seconds", seconds))
 
     def drop_requests(self) -> AbstractContextManager[None]:
         """Lose every request that arrives in this block."""

@@ -13,8 +13,14 @@ from rosasync._actions.status import GoalStatus
 from rosasync._core.text import count
 from rosasync._ros.messages import make_message, to_dict
 from rosasync._ros.types import action_type
-from rosasync.errors import GoalAborted, GoalCanceled, GoalRejected, SessionClosed
-from rosasync.options import check_seconds
+from rosasync.errors import (
+    GoalAborted,
+    GoalCanceled,
+    GoalRejected,
+    SessionClosed,
+    UsageError,
+)
+from rosasync.options import check_hook, check_seconds
 from rosasync.testing._arrivals import Arrivals
 from rosasync.testing._faults import Faults, FaultyService, OpenService, StubCall, set_in_block
 from rosasync.testing._matching import describe, explain_mismatch
@@ -113,7 +119,7 @@ class StubActionServer(Generic[GoalT, ResultT, FeedbackT]):
         if handler is STUB:
             self._handler = self._run
             self._options = {"concurrency": 100, "on_goal": self._is_accepted, **options}
-        self._on_cancel = self._options.pop("on_cancel", None)
+        self._on_cancel = check_hook("on_cancel", self._options.pop("on_cancel", None), "goal")
         self._open_server = open_server
         self._rules = Rules[_Plan](self._type.Goal, on_unexpected)
         # What `_is_accepted` has decided on the goal that is accepted next, and on those that run.
@@ -180,7 +186,12 @@ class StubActionServer(Generic[GoalT, ResultT, FeedbackT]):
 
         Raises:
             TypeError, ValueError: an answer or a field does not fit the action type.
+            UsageError: the server has a handler.
         """
+        if self._handler != self._run:
+            raise UsageError(f"{self.action_name}: its handler answers: use stub_action for that")
+        if isinstance(feedback, Mapping | self._type.Feedback):
+            raise TypeError("feedback must be a list of messages or mappings, not a single one")
         self._rules.check(self.action_name, match, answers)
         messages = tuple(make_message(self._type.Feedback, message) for message in feedback)
         seconds = check_seconds("delay", delay)
@@ -196,7 +207,7 @@ class StubActionServer(Generic[GoalT, ResultT, FeedbackT]):
 
     def delay_responses(self, seconds: float) -> AbstractContextManager[None]:
         """Delay the answers to goals and cancellations by a number of seconds, in this block."""
-        return set_in_block(self._faults, "delay", seconds)
+        return set_in_block(self._faults, "delay", check_seconds("seconds", seconds))
 
     def drop_requests(self) -> AbstractContextManager[None]:
         """Lose every goal and cancellation that arrives in this block."""
