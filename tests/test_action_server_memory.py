@@ -12,11 +12,21 @@ import pytest
 from action_msgs.msg import GoalStatusArray
 from test_msgs.action import Fibonacci
 
-from rosasync import ContextShutdown, GoalAborted, GoalStatus, ServerGone, Session, UsageError
+from rosasync import (
+    ContextShutdown,
+    GoalAborted,
+    GoalCanceled,
+    GoalStatus,
+    ServerGone,
+    Session,
+    UsageError,
+)
+from rosasync._actions import server_goals
 from rosasync._core.ports import TopicQos
 from rosasync.testing import VirtualClock
 from tests.support.fake_graph import FakeGraph
-from tests.support.times import LIMIT, until
+from tests.support.serving import AnyServer, UnmatchedClients
+from tests.support.times import LIMIT, TICK, until
 from tests.support.traced import Recorder
 
 SEND, GET = Fibonacci.Impl.SendGoalService, Fibonacci.Impl.GetResultService
@@ -24,6 +34,10 @@ SEND, GET = Fibonacci.Impl.SendGoalService, Fibonacci.Impl.GetResultService
 
 async def at_once(goal: Any) -> Any:
     return {"sequence": [goal.request.order]}
+
+
+async def forever(goal: Any) -> Any:
+    await asyncio.Event().wait()
 
 
 def goal_of(order: int = 0) -> Any:
@@ -35,7 +49,8 @@ def goal_of(order: int = 0) -> Any:
 
 async def run(session: Session, request: Any) -> Any:
     """Send a goal, and return the response with its result."""
-    assert (await session.call(SEND, "/fib/_action/send_goal", request)).accepted
+    response = await session.call(SEND, "/fib/_action/send_goal", request, timeout=None)
+    assert response.accepted
     return await get(session, request)
 
 
@@ -136,6 +151,73 @@ async def test_the_status_of_many_goals_is_published_less_often(fake_graph: Fake
         assert [each.status for each in last] == [GoalStatus.SUCCEEDED] * 119
 
 
+def service_of(session: Session, part: str) -> AnyServer:
+    """One of the services of the action that a session serves."""
+    (service,) = (each for each in session.core.servers if each.srv_name.endswith(part))
+    return service
+
+
+class TestEnding:
+    """Clients that have not asked for their result when the server is closed."""
+
+    async def test_one_that_was_told_of_its_acceptance_late(
+        self, fake_graph: FakeGraph, virtual_clock: VirtualClock
+    ) -> None:
+        async with fake_graph.session() as session, fake_graph.session() as client:
+            server = session.serve_action(Fibonacci, "/fib", forever)
+            clients = UnmatchedClients(service_of(session, "send_goal"))
+            task = asyncio.create_task(run(client, goal_of()))
+            await virtual_clock.advance(8.0)
+            assert clients.attempts > 3
+            ends: list[asyncio.Task[None]] = []
+            send = clients._send
+
+            def send_and_end(header: Any, response: Any) -> None:
+                send(header, response)
+                ends.append(asyncio.create_task(server.aclose()))
+
+            clients._send = send_and_end
+            clients.unmatched = False
+            fake_graph.delay = 2.0
+            await virtual_clock.advance(2.0)
+            assert ends
+            fake_graph.delay = 0.0
+            await virtual_clock.advance(4.0)
+            assert (await task).status == GoalStatus.CANCELED
+            await asyncio.gather(*ends)
+
+    async def test_one_that_has_left(
+        self, fake_graph: FakeGraph, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(server_goals, "ASKING_TIME", 2 * LIMIT)
+        async with fake_graph.session() as session:
+            server = session.serve_action(Fibonacci, "/fib", forever)
+            async with fake_graph.session() as client:
+                assert (await client.call(SEND, "/fib/_action/send_goal", goal_of())).accepted
+                closing = asyncio.create_task(server.aclose())
+                await until(lambda: server.statistics().canceled)
+                await asyncio.sleep(2 * TICK)
+                assert not closing.done()
+            async with asyncio.timeout(LIMIT):
+                await closing
+
+    async def test_one_that_has_never_asked(
+        self, fake_graph: FakeGraph, virtual_clock: VirtualClock, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Its acceptance was sent long ago, so its request is not under way."""
+        monkeypatch.setattr(server_goals, "ASKING_TIME", 2 * LIMIT)
+        async with fake_graph.session() as session, fake_graph.session() as client:
+            server = session.serve_action(Fibonacci, "/fib", forever, concurrency=2)
+            assert (await client.call(SEND, "/fib/_action/send_goal", goal_of())).accepted
+            await virtual_clock.advance(11 * LIMIT)
+            task = asyncio.create_task(client.act(Fibonacci, "/fib"))
+            await until(lambda: server.statistics().asking)
+            async with asyncio.timeout(LIMIT):
+                await server.aclose()
+            with pytest.raises(GoalCanceled):
+                await task
+
+
 class TestTracing:
     """The trace of a session follows goals, and their calls only if it asks for them."""
 
@@ -199,7 +281,8 @@ class TestTracing:
         assert trace.of("server") == ["handling > dropped"]
 
 
-def test_feedback_from_a_thread_that_outlasts_the_loop() -> None:
+def test_feedback_from_a_thread_that_outlasts_the_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server_goals, "ASKING_TIME", 0.0)
     goals: list[Any] = []
 
     async def handler(goal: Any) -> Any:

@@ -188,10 +188,10 @@ class ActionServer(Generic[GoalT, ResultT, FeedbackT]):
 
         It rejects further goals, cancels those that wait or run, and gives their handlers
         ``timeout`` seconds to end (None: without a limit). Each client that waits for a result gets
-        it: CANCELED, or ABORTED if the handler still runs then. A client whose goal was accepted
-        within the last second, and whose request for the result has not come yet, is waited for
-        until this second is over. Then the server leaves the graph, and the results that it kept
-        are gone.
+        it: CANCELED, or ABORTED if the handler still runs then. A client that was told of its
+        acceptance within the last four seconds, and whose request for the result has not come yet,
+        is waited for until these are over, unless no client is left. Then the server leaves the
+        graph, and the results that it kept are gone.
 
         A handler may close its server, or its session, itself or in a task that it starts. It is
         then neither waited for nor cancelled, and its goal ends as ABORTED.
@@ -330,7 +330,12 @@ class ActionServer(Generic[GoalT, ResultT, FeedbackT]):
         self._runner.abort_all()
         self._goals.flush()
         await self._feedback.wait()
-        await self._goals.until_asked()
+        # An acceptance may wait to be sent again. Its client asks for the result afterwards.
+        *_, send_goal = self._services
+        age = await send_goal.until_sent(CLOSE_TIMEOUT)
+        await self._goals.until_asked(
+            age, lambda: self._node.queries.count_clients(self._action.send_goal)
+        )
         # Each waits until the clients have received its last responses.
         await asyncio.gather(*(service.aclose(CLOSE_TIMEOUT) for service in self._services))
         self.end(functools.partial(SessionClosed, f"{self.action_name}: the server is closed"))

@@ -6,13 +6,13 @@ import asyncio
 import contextlib
 import functools
 import logging
-import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from rosasync._actions.goal_table import CancelSelection, GoalEvent, GoalRecord, GoalTable
 from rosasync._actions.status import GoalStatus
 from rosasync._actions.status_list import StatusList
+from rosasync._server.resending import RESEND_TIME
 from rosasync._status.wire import Outcome
 from rosasync.errors import ContextShutdown, SessionClosed
 
@@ -32,8 +32,11 @@ DELAY = 20e-6
 """Seconds by which each goal that is listed then delays the message."""
 MAX_DELAY = 0.05
 """Maximum number of seconds of this delay."""
-ASKING_TIME = 1.0
-"""Seconds after a goal's acceptance in which its client may be about to ask for the result."""
+ASKING_TIME = 4.0
+"""Seconds after an acceptance was sent in which its client may be about to ask for the result. The
+middleware of a stock client repairs a lost request after 3 s."""
+ASKING_INTERVAL = 0.05
+"""Seconds between two queries whether any client is left that could ask."""
 
 
 class ServerGoals:
@@ -159,23 +162,29 @@ class ServerGoals:
             call.response.status = int(GoalStatus.UNKNOWN)
             self._respond(call, call.response)
 
-    async def until_asked(self) -> None:
-        """Wait for the requests for results that may be on their way, `ASKING_TIME` at most.
+    async def until_asked(self, age: float, count_clients: Callable[[], int]) -> None:
+        """Wait for the requests for results that may be on their way.
 
         A client learns that its goal is accepted, and asks then. If the server ended in between, it
         would wait for ever.
+
+        Args:
+            age: seconds since the last acceptance was sent. It may have been sent long after the
+                goal was accepted: the middleware may not have discovered its client.
+            count_clients: counts the clients that are left; raises ContextShutdown.
         """
-        newest = max(self._unasked.values(), default=-math.inf)
-        recent = {
-            goal_id
-            for goal_id, accepted in self._unasked.items()
-            if accepted + ASKING_TIME > self._loop.time()
-        }
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout_at(newest + ASKING_TIME):
-                while not recent.isdisjoint(self._unasked):
-                    self._asked.clear()
-                    await self._asked.wait()
+        until = self._loop.time() + ASKING_TIME - age
+        # The acceptances of the others were sent, or given up, long ago.
+        since = self._loop.time() - age - RESEND_TIME
+        recent = {goal_id for goal_id, accepted in self._unasked.items() if accepted > since}
+        with contextlib.suppress(ContextShutdown):
+            while not recent.isdisjoint(self._unasked) and count_clients():
+                left = until - self._loop.time()
+                if left <= 0:
+                    return
+                self._asked.clear()
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(self._asked.wait(), min(left, ASKING_INTERVAL))
 
     def flush(self) -> None:
         """Publish the status at once, if it has changed since it was published."""

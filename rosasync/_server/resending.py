@@ -12,11 +12,13 @@ if TYPE_CHECKING:
     from rosasync._server.handler_tasks import Spawn
     from rosasync.tracing import ServerTrace
 
-__all__ = ["RESEND", "Resender", "Unsent"]
+__all__ = ["RESEND", "RESEND_TIME", "Resender", "Unsent"]
 
 RESEND = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 1.6, 1.6, 1.6, 1.6)
 """Seconds to wait before each further attempt to send a response to a client that the middleware
 has not discovered completely."""
+RESEND_TIME = 2 * sum(RESEND)
+"""Seconds after which a response has been sent or given up, also on a machine with other work."""
 MAX_UNSENT = 1000
 """Maximum number of responses of a server that wait to be sent again."""
 

@@ -93,6 +93,11 @@ class ResponseSender(Generic[ResponseT]):
         """Return whether the response to a request waits to be sent again."""
         return self._resender.has(header)
 
+    @property
+    def age(self) -> float:
+        """The seconds since the last response was sent; infinite if there was none."""
+        return monotonic() - self._last_sent
+
     def check_open(self) -> None:
         """Raise the error for later responses, if there is one."""
         if self.ending is not None:

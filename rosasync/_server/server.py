@@ -266,6 +266,21 @@ class ServiceServer(Generic[RequestT, ResponseT]):
             self._end_task = self._loop.create_task(self._end(seconds))
         await until_done(self._end_task)
 
+    async def until_sent(self, timeout: float) -> float:
+        """Wait until each response is sent that is due: of a handler, or to be sent again.
+
+        For the end of an action server, which then goes on to take requests.
+
+        Args:
+            timeout: maximum number of seconds to wait.
+
+        Returns:
+            The seconds since the last response; infinite if there was none.
+        """
+        self.exclude_caller()
+        await self._tasks.wait(self._loop.time() + timeout)
+        return self._sender.age
+
     def exclude_caller(self) -> None:
         """Exclude the calling handler from those that the end of the server waits for.
 
@@ -334,12 +349,9 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         """Settle a call for which the backlog has no room."""
         self._counts.rejected += 1
         if self._on_overload is None:
-            self._give_up_dropped(call)
+            _give_up_dropped(call)
         else:
-            self._runner.call_hook(call, self._on_overload, (call,), self._give_up_dropped)
-
-    def _give_up_dropped(self, call: ServiceCall[RequestT, ResponseT]) -> None:
-        call.give_up("dropped: too many requests were waiting", Outcome.DROPPED)
+            self._runner.call_hook(call, self._on_overload, (call,), _give_up_dropped)
 
     def _on_abandoned(self, call: ServiceCall[RequestT, ResponseT]) -> None:
         """Drop a call whose caller has left, or cancel its handler if that is wished.
@@ -413,6 +425,10 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         await self._sender.wait_until_delivered(left)
         await asyncio.sleep(self._port.destroy_delay)
         self.end(functools.partial(SessionClosed, f"{self._name}: the server is closed"))
+
+
+def _give_up_dropped(call: ServiceCall[Any, Any]) -> None:
+    call.give_up("dropped: too many requests were waiting", Outcome.DROPPED)
 
 
 def _waited(header: RequestHeader) -> float:
