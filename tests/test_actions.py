@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Literal
 from uuid import uuid4
@@ -13,6 +14,7 @@ from test_msgs.action import Fibonacci, NestedMessage
 
 from rosasync import (
     CancelRejected,
+    ContextShutdown,
     GoalAborted,
     GoalCanceled,
     GoalRejected,
@@ -396,6 +398,37 @@ async def test_the_server_vanishes(session: Session, action_server: ActionServer
         await action_server.stop("/held")
         with pytest.raises(ServerGone, match="every server vanished before the goal ended"):
             await goal.result()
+
+
+def shut_down_silently(context: Any) -> None:
+    """Shut a context down as rclpy's signal handler does: nothing reports it."""
+    with context.handle:
+        context.handle.shutdown()
+
+
+@pytest.mark.parametrize("shut_down", [lambda context: context.shutdown(), shut_down_silently])
+async def test_the_context_is_shut_down(
+    session: Session, action_server: ActionServerProcess, shut_down: Callable[[Any], None]
+) -> None:
+    await action_server.serve("/held", hold=True)
+    async with session.goal(Fibonacci, "/held") as goal:
+        await asyncio.to_thread(shut_down, session.node.context)
+        with pytest.raises(ContextShutdown):
+            await goal.result()
+
+
+async def test_the_context_of_a_borrowed_node_is_shut_down(
+    bridge: Bridge, action_server: ActionServerProcess
+) -> None:
+    await action_server.serve("/held", hold=True)
+    with borrowed_node() as node:
+        async with (
+            Session(node, bridge=bridge, timeout=LIMIT) as session,
+            session.goal(Fibonacci, "/held") as goal,
+        ):
+            await asyncio.to_thread(shut_down_silently, node.context)
+            with pytest.raises(ContextShutdown):
+                await goal.result()
 
 
 async def test_forty_goals_at_once(session: Session, action_server: ActionServerProcess) -> None:

@@ -199,8 +199,11 @@ class ActionClient:
         """
         for goal in self.goals:
             goal.close(make_error)
-        tasks = [self._cancellations.abandon(goal) for goal in self.goals]
-        return {task for task in tasks if task is not None} if self._watch.exists() else set()
+        tasks = {task for goal in self.goals if (task := self._cancellations.abandon(goal))}
+        with suppress(ContextShutdown):
+            if tasks and self._watch.exists():
+                return tasks
+        return set()
 
     def end(self, make_error: Callable[[], Exception]) -> None:
         """End every goal with an error, and destroy the ports; idempotent."""
