@@ -27,9 +27,11 @@ from rosasync import (
     UsageError,
 )
 from rosasync._actions import server_watch
+from rosasync._client import graph_watch
+from rosasync.testing import VirtualClock
 from tests.support.action_servers import ActionServerProcess, none_runs
 from tests.support.nodes import borrowed_node
-from tests.support.times import LIMIT, TICK, until
+from tests.support.times import LIMIT, TICK, count_timers, until
 
 if TYPE_CHECKING:
     from tests.conftest import Bridge
@@ -429,6 +431,25 @@ async def test_the_context_of_a_borrowed_node_is_shut_down(
             await asyncio.to_thread(shut_down_silently, node.context)
             with pytest.raises(ContextShutdown):
                 await goal.result()
+
+
+async def test_a_goal_that_runs_for_an_hour(
+    session: Session,
+    action_server: ActionServerProcess,
+    virtual_clock: VirtualClock,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Between the requests for its result it wakes nothing, except the poll of the context."""
+    monkeypatch.setattr(graph_watch, "POLL_CONTEXT", 1e6)
+    await action_server.serve("/held", hold=True)
+    async with session.goal(Fibonacci, "/held", {"order": 3}) as goal:
+        await virtual_clock.advance(0.0)
+        timers = count_timers(monkeypatch)
+        await virtual_clock.advance(3600.0)
+        assert len(timers) < 60
+        await action_server.release("/held")
+        result = await goal.result()
+        assert list(result.sequence) == [0, 1, 2]
 
 
 async def test_forty_goals_at_once(session: Session, action_server: ActionServerProcess) -> None:

@@ -146,7 +146,9 @@ class ActiveGoal:
             self.status = status
 
     def show(self, status: GoalStatus, now: float) -> None:
-        """Set the status that the status topic shows, at this loop time."""
+        """Set the status that the server shows, at this loop time."""
+        if not self.is_accepted:
+            self.plan.accepted(now)
         self.update(status)
         if status in TERMINAL:
             self.plan.ended(now)

@@ -94,6 +94,7 @@ class Cancellations:
         tracing: the session's.
         errors: the errors of goals.
         watch: the action's servers.
+        on_status: called with a goal and a status that an answer shows.
         on_left: called with a goal whose caller has left, when nothing is left to do for it.
         on_shutdown: called if the context was shut down.
     """
@@ -105,6 +106,7 @@ class Cancellations:
         tracing: Tracing,
         errors: GoalErrors,
         watch: ServerWatch,
+        on_status: Callable[[ActiveGoal, GoalStatus], None],
         on_left: Callable[[ActiveGoal], object],
         on_shutdown: Callable[[], object],
     ) -> None:
@@ -114,6 +116,7 @@ class Cancellations:
         self._tracing = tracing
         self._errors = errors
         self._watch = watch
+        self._on_status = on_status
         self._on_left = on_left
         self._on_shutdown = on_shutdown
         self._tasks: set[asyncio.Task[None]] = set()
@@ -222,7 +225,7 @@ class Cancellations:
             call = start_task(self._loop, service.call(request, timeout, True, CANCEL_RETRY))
         response = await call
         if any(uuid_of(info.goal_id) == goal.key for info in response.goals_canceling):
-            goal.update(GoalStatus.CANCELING)
+            self._on_status(goal, GoalStatus.CANCELING)
             return CancelAnswer.AGREED
         if response.return_code == response.ERROR_UNKNOWN_GOAL_ID:
             return CancelAnswer.UNKNOWN

@@ -70,19 +70,25 @@ class ActionClient:
         self.action = action
         self.errors = GoalErrors(action, node)
         self._loop = asyncio.get_running_loop()
-        self._node = node
         self._pool = pool
         self._tracing = tracing
         self._owner = owner
         self._types = action.action_type.Impl
-        self.goals = ActiveGoals(self._tick, self._close_ports)
-        self._topics = ActionTopics(action, node, self.goals.find)
+        self.goals = ActiveGoals(self._on_due, self._close_ports)
+        self._topics = ActionTopics(action, node, self.goals.find, self._on_status)
         self._results = ResultRequests(
             node, action.get_result, self._types.GetResultService.Request, self._on_result
         )
         self._watch = ServerWatch(action, node, pool, self.errors, (self._results, self._topics))
         self._cancellations = Cancellations(
-            action, pool, tracing, self.errors, self._watch, self._let_go, owner.on_shutdown
+            action,
+            pool,
+            tracing,
+            self.errors,
+            self._watch,
+            self._on_status,
+            self._let_go,
+            owner.on_shutdown,
         )
         self.cancel = self._cancellations.cancel
         # Ends the goals whose servers have vanished.
@@ -243,10 +249,9 @@ class ActionClient:
     def _cancel_failed(self, goal: ActiveGoal) -> None:
         """Cancel a goal that has ended for its callers, but may run on a server."""
         other = ActiveGoal(goal.id, goal.started)
-        other.update(GoalStatus.ACCEPTED)
         with suppress(SessionClosed, ContextShutdown):
             self._add(other)
-            self._ask(other)
+            self._accepted(other, None)
             self._cancellations.abandon(other)
 
     def _let_go(self, goal: ActiveGoal) -> None:
@@ -257,38 +262,33 @@ class ActionClient:
             self._remove(goal)
             goal.end_trace(None)
 
-    def _tick(self) -> None:
-        try:
-            if not self._node.ok():
-                raise ContextShutdown
-            if not self._node.graph_events:
-                self.on_graph()
-        except ContextShutdown:
-            self._owner.on_shutdown()
-            return
-        now = self._loop.time()
-        for goal in self.goals:
-            self._check(goal, now)
-
-    def _check(self, goal: ActiveGoal, now: float) -> None:
-        """Do for a goal what time demands."""
-        due = goal.plan.due(now)
-        if goal.is_accepted and not goal.answered.is_set():
-            # The status topic shows the acceptance, and the response was lost.
+    def _on_status(self, goal: ActiveGoal, status: GoalStatus) -> None:
+        """Note a status that the server shows."""
+        goal.show(status, self._loop.time())
+        if goal.acceptance is None and not goal.answered.is_set():
+            # An attached goal: no response is awaited, and a new server may have it.
             self._accepted(goal, None)
-            if goal.acceptance is not None:
-                goal.acceptance.cancel()
-        elif due is Due.GIVE_UP:
+        self.goals.reschedule(goal)
+
+    def _on_due(self, goal: ActiveGoal, due: Due) -> None:
+        """Do for a goal what its plan demands."""
+        if due is Due.GIVE_UP:
             status = goal.status.name
             what = f"it ended as {status}, and the server does not send its result"
             self._fail(goal, self.errors.goal(GoalTimeout, goal, what))
-        elif due is Due.ASK:
+        elif goal.asked:
             self._ask(goal)
+        else:
+            # A status has shown the acceptance, and the response was lost.
+            self._accepted(goal, None)
+            if goal.acceptance is not None:
+                goal.acceptance.cancel()
 
     def _ask(self, goal: ActiveGoal, room: bool = False) -> None:
         self._results.ask(goal.key, room=room)
         goal.asked = True
         goal.plan.asked(self._loop.time())
+        self.goals.reschedule(goal)
 
     def _close_ports(self) -> None:
         self.goals.stop_timer()
@@ -356,7 +356,7 @@ class ActionClient:
             goal.result()
 
     def _accepted(self, goal: ActiveGoal, stamp: Any) -> None:
-        """Follow a goal from its acceptance on; without a stamp if the response was lost."""
+        """Follow a goal from its acceptance on; without a stamp if there is no response."""
         if stamp is not None:
             goal.accepted_at = stamp.sec * 1_000_000_000 + stamp.nanosec
         if not goal.asked:
@@ -364,9 +364,12 @@ class ActionClient:
             if goal.trace is not None:
                 goal.trace.enter("accepted")
             self._ask(goal, room=stamp is not None)
-            with suppress(ContextShutdown):
-                goal.servers |= self._watch.servers_now()
-                self._expect_loss((goal,))
+        if stamp is None:
+            # A status may come before the event of the graph that shows its server.
+            self._watch.reset()
+        with suppress(ContextShutdown):
+            goal.servers |= self._watch.servers_now()
+            self._expect_loss((goal,))
         goal.answered.set()
 
     # Their results, and what takes their place.

@@ -19,6 +19,7 @@ from rosasync.options import check_count, check_seconds, check_timeout, check_wa
 if TYPE_CHECKING:
     from contextlib import AbstractAsyncContextManager
 
+    from rosasync._client.graph_watch import GraphWatch
     from rosasync._client.pool import ClientPool
     from rosasync._core.ports import Action, NodePort
     from rosasync.tracing import Tracing
@@ -58,6 +59,7 @@ class Actions:
         self,
         node: NodePort,
         pool: ClientPool,
+        graph_watch: GraphWatch,
         tracing: Tracing,
         timeout: float | None,
         on_shutdown: Callable[[], None],
@@ -66,6 +68,10 @@ class Actions:
         self._loop = asyncio.get_running_loop()
         self._node = node
         self._pool = pool
+        self._graph_watch = graph_watch
+        # The generation of the graph in which the servers of the goals were checked.
+        self._checked_generation = graph_watch.generation
+        graph_watch.add(self)
         self._tracing = tracing
         self._timeout = timeout
         self._closing: Callable[[], Exception] | None = None
@@ -238,14 +244,31 @@ class Actions:
             self._clients[key] = client
         return client
 
-    def graph_changed(self) -> None:
-        """Look for servers that have vanished, because the graph has changed.
+    # For the watch of the graph.
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether goals are out, so that the polling which their services have started goes on."""
+        return self.out > 0
+
+    @property
+    def awaits_match(self) -> bool:
+        """False: the services, and each `ServerWatch`, wait for the matches of a goal."""
+        return False
+
+    def on_graph(self) -> None:
+        """Look whether the servers of the goals have vanished, if the graph may have changed.
 
         Raises:
             ContextShutdown: the node is down.
         """
-        for client in tuple(self._clients.values()):
-            client.on_graph()
+        generation = self._graph_watch.generation
+        if generation != self._checked_generation:
+            self._checked_generation = generation
+            for client in tuple(self._clients.values()):
+                client.on_graph()
+
+    # The end.
 
     def end(self, make_error: Callable[[], Exception]) -> None:
         """End every goal with an error; nothing can be cancelled any more. Idempotent."""

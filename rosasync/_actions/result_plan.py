@@ -7,6 +7,8 @@ import math
 
 __all__ = ["Due", "ResultPlan"]
 
+ANSWER_PATIENCE = 0.25
+"""Seconds to wait for the response to a goal that is known to have been accepted."""
 FIRST_ASK = 5.0
 """Seconds after which a result is asked for again. The intervals grow."""
 LAST_ASK = 300.0
@@ -33,12 +35,25 @@ class ResultPlan:
     has ended.
     """
 
-    __slots__ = ("_ask_at", "_delay", "_ended_at")
+    __slots__ = ("_ask_at", "_delay", "_give_up_at")
 
     def __init__(self) -> None:
         self._ask_at = math.inf
+        self._give_up_at = math.inf
         self._delay = FIRST_ASK
-        self._ended_at: float | None = None
+
+    @property
+    def next_time(self) -> float:
+        """When there is something to do next; infinite if that is not known yet."""
+        return min(self._ask_at, self._give_up_at)
+
+    def accepted(self, now: float) -> None:
+        """Note that the goal is known to be accepted, although its acceptance has not arrived.
+
+        That is on its way, or lost.
+        """
+        if self._ask_at == math.inf:
+            self._ask_at = now + ANSWER_PATIENCE
 
     def asked(self, now: float) -> None:
         """Note that the result was asked for."""
@@ -47,13 +62,13 @@ class ResultPlan:
 
     def ended(self, now: float) -> None:
         """Note that the goal has ended, so that its result is there; only the first time counts."""
-        if self._ended_at is None:
-            self._ended_at = now
+        if self._give_up_at == math.inf:
+            self._give_up_at = now + ENDED_PATIENCE
             self._delay = 2 * ENDED_ASK
             self._ask_at = now + ENDED_ASK
 
     def due(self, now: float) -> Due:
         """Return what there is to do."""
-        if self._ended_at is not None and now - self._ended_at > ENDED_PATIENCE:
+        if now >= self._give_up_at:
             return Due.GIVE_UP
         return Due.ASK if now >= self._ask_at else Due.NOTHING

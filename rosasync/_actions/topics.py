@@ -39,14 +39,22 @@ class ActionTopics:
         action: the action.
         node: creates the subscriptions.
         find: returns the goal that is out under the bytes of a UUID, or None.
+        on_status: called with a goal and a status of it that comes after the last one known.
     """
 
-    def __init__(self, action: Action, node: NodePort, find: FindGoal) -> None:
+    def __init__(
+        self,
+        action: Action,
+        node: NodePort,
+        find: FindGoal,
+        on_status: Callable[[ActiveGoal, GoalStatus], None],
+    ) -> None:
         self._loop = asyncio.get_running_loop()
         self._action = action
         self._types = action.action_type.Impl
         self._node = node
         self._find = find
+        self._report_status = on_status
         self._feedback: SubscriptionPort | None = None
         self._statuses: SubscriptionPort | None = None
         # Whether the subscription to statuses has got a message, and who published the topic then.
@@ -157,11 +165,10 @@ class ActionTopics:
         except ValueError as error:
             logger.error("%s: a status message is dropped: %s", self._action.name, error)
             return
-        now = self._loop.time()
         for key, status in statuses:
             goal = self._find(key)
-            if goal is not None and 0 < status <= GoalStatus.ABORTED:
-                goal.show(GoalStatus(status), now)
+            if goal is not None and goal.status < status <= GoalStatus.ABORTED:
+                self._report_status(goal, GoalStatus(status))
 
     def _decode_statuses(self, serialized: bytes) -> Iterable[tuple[bytes, int]]:
         statuses = read_statuses(serialized)

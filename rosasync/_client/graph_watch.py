@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Protocol
 
@@ -23,23 +23,23 @@ tell whether the port's reader is alive."""
 POLL_MAX = 0.25
 """Maximum number of seconds between two polls while callers wait for a match."""
 POLL_CONTEXT = 0.5
-"""Seconds between two polls of the context while requests are outstanding. They are needed because
-rclpy's signal handler shuts a context down without an event."""
+"""Seconds between two polls of the context while requests or goals are out. They are needed because
+rclpy's signal handler shuts every context of the process down without an event."""
 
 
 class Watcher(Protocol):
-    """A service that depends on the graph."""
+    """A service, or the actions of a session, which depend on the graph."""
 
     @property
     def is_busy(self) -> bool:
-        """Whether there are callers, or requests without a caller."""
+        """Whether there are callers, requests without a caller, or goals that are out."""
 
     @property
     def awaits_match(self) -> bool:
         """Whether callers wait for a client to be matched."""
 
     def on_graph(self) -> None:
-        """Check the graph again.
+        """Check the graph again, which may be the same as before.
 
         Raises:
             ContextShutdown: the node is down.
@@ -47,45 +47,44 @@ class Watcher(Protocol):
 
 
 class GraphWatch:
-    """Makes the services of a pool check the graph again when it may have changed.
+    """Makes the services and actions of a session check the graph when it may have changed.
 
     Confined to the loop's thread. A change of the graph begins a new generation, in which the match
-    of every client is checked again. A match is not an event of the graph, so one timer for all
-    services polls for it. The timer starts when a caller waits for a match or a request is sent,
-    and stops when a poll finds neither callers nor requests.
+    of every client is checked again. A match is not an event of the graph, so one timer for all of
+    them polls for it. The timer starts when a caller waits for a match, or a request or a goal is
+    sent, and stops when a poll finds neither callers nor requests nor goals.
 
     Attributes:
         generation: counts the changes of the graph.
         polling: whether the timer runs.
     """
 
-    def __init__(
-        self,
-        node: NodePort,
-        services: Collection[Watcher],
-        on_shutdown: Callable[[], object],
-    ) -> None:
+    def __init__(self, node: NodePort, on_shutdown: Callable[[], object]) -> None:
         self._loop = asyncio.get_running_loop()
         self._node = node
-        self._services = services
         self._on_shutdown = on_shutdown
+        self._watchers: list[Watcher] = []
         self.generation = 0
         self.polling = False
         self._timer: asyncio.TimerHandle | None = None
         self._delay = POLL_MIN
         self._closed = False
 
+    def add(self, watcher: Watcher) -> None:
+        """Add something that depends on the graph, for as long as the session lasts."""
+        self._watchers.append(watcher)
+
     def changed(self) -> None:
         """Begin a new generation: the graph has changed."""
         if self._closed:
             return
         self.advance()
-        self._check_services()
-        if any(service.awaits_match for service in self._services):
+        self._check()
+        if any(watcher.awaits_match for watcher in self._watchers):
             self.poll_soon()
 
     def advance(self) -> None:
-        """Begin a new generation without checking the services."""
+        """Begin a new generation without checking anything."""
         self.generation += 1
 
     def poll_soon(self) -> None:
@@ -124,17 +123,17 @@ class GraphWatch:
             self.advance()
         # `polling` stays set during this, because a dispatch would start the slow timer otherwise.
         try:
-            self._check_services()
+            self._check()
         finally:
             self._poll_again()
 
     def _poll_again(self) -> None:
         if self._timer is not None or self._closed:
             return
-        if any(service.awaits_match for service in self._services):
+        if any(watcher.awaits_match for watcher in self._watchers):
             self._delay = min(self._delay * POLL_GROWTH, POLL_MAX)
             self._poll_in(self._delay)
-        elif any(service.is_busy for service in self._services):
+        elif any(watcher.is_busy for watcher in self._watchers):
             self._poll_in(POLL_CONTEXT)
         else:
             self.polling = False
@@ -147,7 +146,7 @@ class GraphWatch:
         except ContextShutdown:
             self._on_shutdown()
 
-    def _check_services(self) -> None:
+    def _check(self) -> None:
         with self.reports_shutdown():
-            for service in tuple(self._services):
-                service.on_graph()
+            for watcher in tuple(self._watchers):
+                watcher.on_graph()

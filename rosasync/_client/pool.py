@@ -8,7 +8,6 @@ from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Generic, overload
 
-from rosasync._client.graph_watch import GraphWatch
 from rosasync._client.latency import summarize
 from rosasync._client.service import MATCH_TIMEOUT, ServicePool
 from rosasync._client.service_watch import ServiceState, watch_servers
@@ -26,6 +25,7 @@ if TYPE_CHECKING:
     from rclpy.qos import QoSProfile
 
     from rosasync._client.client import Client
+    from rosasync._client.graph_watch import GraphWatch
     from rosasync._core.arguments import ArgumentChecker
     from rosasync._core.ports import NodePort, Service
     from rosasync.options import Limits, Retry
@@ -47,7 +47,7 @@ class ClientPool:
         arguments: ArgumentChecker,
         limits: Limits,
         timeout: float | None,
-        on_shutdown: Callable[[], object],
+        watch: GraphWatch,
         tracing: Tracing,
     ) -> None:
         self._loop = asyncio.get_running_loop()
@@ -63,7 +63,7 @@ class ClientPool:
         self._shortcuts: dict[tuple[Any, str], ServicePool] = {}
         self._deadlines = Deadlines()
         self.listener = Listener(node)
-        self._watch = GraphWatch(node, self._services.values(), on_shutdown)
+        self._watch = watch
         self._watchers: set[asyncio.Event] = set()
         self._ending: Callable[[], Exception] | None = None
 
@@ -221,6 +221,7 @@ class ClientPool:
                 self.listener,
             )
             self._services[service.key, limits] = pool
+            self._watch.add(pool)
         return pool
 
     async def watch(self, service: Service) -> AsyncIterator[ServiceState]:
@@ -234,7 +235,7 @@ class ClientPool:
             self._watchers.discard(changed)
 
     def graph_changed(self) -> None:
-        """Make the services check the ROS graph again, because it has changed."""
+        """Make services and actions check the ROS graph again, because it has changed."""
         self._watch.changed()
         self._wake_watchers()
 

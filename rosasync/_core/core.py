@@ -19,6 +19,7 @@ import anyio
 
 from rosasync._actions.registry import Actions
 from rosasync._actions.server import ActionServer
+from rosasync._client.graph_watch import GraphWatch
 from rosasync._client.pool import ClientPool
 from rosasync._core.aio import until_done
 from rosasync._core.arguments import ArgumentChecker
@@ -61,16 +62,17 @@ class Core:
         self.name = self.node.name
         self.arguments = ArgumentChecker(self.node)
         self.tracing = Tracing(options.trace)
+        graph_watch = GraphWatch(self.node, self._context_shut_down)
         self.pool = ClientPool(
-            self.node,
-            self.arguments,
-            options.limits,
-            options.timeout,
-            self._context_shut_down,
-            self.tracing,
+            self.node, self.arguments, options.limits, options.timeout, graph_watch, self.tracing
         )
         self.actions = Actions(
-            self.node, self.pool, self.tracing, options.timeout, self._context_shut_down
+            self.node,
+            self.pool,
+            graph_watch,
+            self.tracing,
+            options.timeout,
+            self._context_shut_down,
         )
         self.portal = Portal(
             self.node, self.gateway, self.arguments, self.pool, self.actions, options.timeout
@@ -273,10 +275,6 @@ class Core:
             server.on_graph()
         for action_server in tuple(self.action_servers):
             action_server.on_graph()
-        try:
-            self.actions.graph_changed()
-        except ContextShutdown:
-            self._context_shut_down()
 
     def _context_shut_down(self) -> None:
         self.actions.end(ContextShutdown)

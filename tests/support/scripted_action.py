@@ -84,12 +84,16 @@ class ScriptedAction:
             publisher.close()
         self.sends.clear()
 
+    def lose_topics(self) -> None:
+        """Publish nothing any more."""
+        self._feedback.close()
+        self._status.close()
+
     def come_back(self, topics: bool = True) -> None:
         """Be there again, with the goals it still has. For the graph it is another server."""
         self._open()
         if not topics:
-            self._feedback.close()
-            self._status.close()
+            self.lose_topics()
 
     def close(self) -> None:
         self.vanish()
