@@ -18,6 +18,7 @@ from test_msgs.action import Fibonacci, NestedMessage
 from rosasync import (
     ActionState,
     AsyncActionProxy,
+    GoalStatus,
     GoalTimeout,
     InvalidServiceName,
     ServiceUnavailable,
@@ -196,6 +197,19 @@ async def test_a_block_explains_how_it_is_entered(session: Session, server: Serv
         with pytest.raises(UsageError, match=rf"is entered once: call {method}\(…\) again"):
             await entered.__aenter__()
     assert len(server.requests) == 1
+
+
+async def test_a_goal_belongs_to_its_loop(session: Session, server: Server) -> None:
+    async with session.goal(Fibonacci, NAME) as goal:
+
+        async def detach() -> None:
+            goal.detach()
+
+        for use in (goal.result, goal.cancel, goal.__anext__, detach):
+            with pytest.raises(UsageError, match="belongs to the loop of its session: in another"):
+                await asyncio.to_thread(asyncio.run, use())
+        await goal.cancel()
+    assert goal.status is GoalStatus.CANCELED
 
 
 @pytest.mark.parametrize("given", [None, "c0ffee", b"", 5])

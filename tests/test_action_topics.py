@@ -23,6 +23,7 @@ from tests.support.nodes import borrowed_node
 from tests.support.times import LIMIT, TICK, until
 
 Impl = Fibonacci.Impl
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 async def test_a_slow_reader_delays_no_other_goal(
@@ -93,6 +94,27 @@ async def test_what_is_for_others_is_not_deserialized(
         await action_server.release("/held")
 
 
+@pytest.mark.parametrize("forged", [b"", b"\xff" * 4, b"\1\0\0\0" + b"\xff" * 24])
+async def test_a_forged_status_is_dropped(
+    session: Session,
+    action_server: ActionServerProcess,
+    caplog: pytest.LogCaptureFixture,
+    forged: bytes,
+) -> None:
+    await action_server.serve("/held", hold=True)
+    with borrowed_node() as node:
+        publisher = node.create_publisher(GoalStatusArray, "/held/_action/status", LATCHED)
+        async with session.goal(Fibonacci, "/held", {"order": 2}) as goal:
+            async with asyncio.timeout(LIMIT):
+                # A subscription may know its publisher much later than the reverse.
+                while "a status message is dropped" not in caplog.text:
+                    publisher.publish(b"\0\1\0\0" + forged)
+                    await asyncio.sleep(TICK)
+            await action_server.release("/held")
+            assert list((await goal.result(LIMIT)).sequence) == [0, 1]
+    assert goal.status is GoalStatus.SUCCEEDED
+
+
 async def test_feedback_and_status_before_the_acceptance_are_kept(session: Session) -> None:
     """Of a server that is slow to answer. A client learns nothing of the goal before."""
     ended = threading.Event()
@@ -122,10 +144,9 @@ def spun(node: Any, ended: threading.Event) -> Iterator[None]:
 
 def serve_hastily(node: Any, name: str, ended: threading.Event) -> None:
     """Serve an action that says everything of a goal before it accepts it, and gives no result."""
-    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     topic = f"{name}/_action"
     feedback = node.create_publisher(Impl.FeedbackMessage, f"{topic}/feedback", 10)
-    statuses = node.create_publisher(GoalStatusArray, f"{topic}/status", latched)
+    statuses = node.create_publisher(GoalStatusArray, f"{topic}/status", LATCHED)
 
     def hold(request: Any, response: Any) -> Any:
         ended.wait(LIMIT)

@@ -34,13 +34,14 @@ class Goal(Generic[ResultT, FeedbackT]):
     Iterating yields the feedback and ends with the goal. Use a goal on the loop's thread.
     """
 
-    __slots__ = ("_client", "_goal", "_queue", "_timeout")
+    __slots__ = ("_client", "_goal", "_loop", "_queue", "_timeout")
 
     def __init__(
         self, client: ActionClient, goal: ActiveGoal, queue: FeedbackQueue, timeout: float | None
     ) -> None:
         self._client = client
         self._goal = goal
+        self._loop = asyncio.get_running_loop()
         self._queue = queue
         self._timeout = timeout
 
@@ -81,6 +82,7 @@ class Goal(Generic[ResultT, FeedbackT]):
         while (feedback := self._queue.take()) is None:
             if self._goal.ended.is_set() or self._queue.closed:
                 raise StopAsyncIteration
+            self._check_loop()
             await self._queue.wait()
         return feedback
 
@@ -97,11 +99,13 @@ class Goal(Generic[ResultT, FeedbackT]):
             ServerGone: the server vanished, or was replaced by one that does not know the goal.
             GoalRejected: an attached goal is not known to the server.
             UsageError: the block was left, and the goal, which was detached or attached, or which
-                the server does not cancel, is not followed any more.
+                the server does not cancel, is not followed any more; called from another loop or
+                thread.
             SessionClosed, ContextShutdown: the session has ended.
         """
         goal = self._goal
         seconds = check_timeout(timeout, None)
+        self._check_loop()
         if not goal.ended.is_set():
             try:
                 async with asyncio.timeout(seconds):
@@ -130,21 +134,32 @@ class Goal(Generic[ResultT, FeedbackT]):
             GoalTimeout: it has not answered in time.
             ServiceUnavailable, ServerGone: there is no server, or no longer.
             SessionClosed, ContextShutdown: the session has ended.
+            UsageError: called from another loop or thread.
         """
+        self._check_loop()
         await self._client.cancel(self._goal, check_timeout(timeout, self._timeout))
 
     def detach(self) -> None:
         """Leave the goal running when the block is left, or the session closed; idempotent.
 
         Raises:
-            UsageError: the block was left already, and the goal is being cancelled.
+            UsageError: the block was left already, and the goal is being cancelled; called from
+                another thread.
         """
+        self._check_loop()
         if self._goal.ending is not None and self._goal.outcome is None:
             raise UsageError(
                 f"{self._client.action.name}: the goal is being cancelled already: call detach() "
                 "before the block ends"
             )
         self._goal.detached = True
+
+    def _check_loop(self) -> None:
+        if asyncio._get_running_loop() is not self._loop:
+            raise UsageError(
+                f"{self._client.action.name}: goal {self.id} belongs to the loop of its session: "
+                "in another thread, use session.from_thread.act(…) or an AsyncActionProxy"
+            )
 
     def _failure(self, outcome: Outcome) -> GoalError:
         canceled = outcome.status is GoalStatus.CANCELED
