@@ -17,7 +17,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from test_msgs.action import Fibonacci
 
 from rosasync import GoalStatus, Session
-from rosasync._actions import active_goals
+from rosasync._actions import active_goals, registry
 from tests.support.action_servers import ActionServerProcess
 from tests.support.nodes import borrowed_node
 from tests.support.times import LIMIT, TICK, until
@@ -45,6 +45,27 @@ async def test_a_slow_reader_delays_no_other_goal(
     assert not slow.done()
     go_on.set()
     await slow
+
+
+async def test_what_never_reaches_a_slow_function_is_logged(
+    session: Session,
+    action_server: ActionServerProcess,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(registry, "ACT_FEEDBACK", 4)
+    await action_server.serve("/fast", feedback=20, readers=1)
+    received: list[int] = []
+
+    async def receive_slowly(feedback: Fibonacci.Feedback) -> None:
+        received.append(feedback.sequence[0])
+        # Until the goal has ended, so that all other feedback has come.
+        await until(lambda: session.core.actions.out == 0)
+
+    await session.act(Fibonacci, "/fast", on_feedback=receive_slowly)
+    dropped = 20 - len(received)
+    assert received[-4:] == [16, 17, 18, 19]
+    assert f"/fast: {dropped} feedback messages of goal" in caplog.text
 
 
 async def test_an_action_has_one_subscription_to_each_topic_while_goals_are_out(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import inspect
+import logging
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
@@ -13,6 +14,7 @@ from uuid import UUID, uuid4
 from rosasync._actions.active_goal import ActiveGoal
 from rosasync._actions.client import ActionClient
 from rosasync._actions.goal import Goal, GoalBlock
+from rosasync._core.text import count
 from rosasync.errors import CallError
 from rosasync.options import check_count, check_seconds, check_timeout, check_wait
 
@@ -26,6 +28,8 @@ if TYPE_CHECKING:
     from rosasync.typing import Timeout
 
 __all__ = ["ActArguments", "Actions"]
+
+logger = logging.getLogger("rosasync")
 
 CLOSE_TIMEOUT = 5.0
 """Seconds for which the end of the session waits for the ends of the goals that it cancels."""
@@ -145,10 +149,7 @@ class Actions:
                     if on_accepted is not None:
                         on_accepted(handle)
                     if on_feedback is not None:
-                        async for message in handle:
-                            returned = on_feedback(message)
-                            if returned is not None and inspect.isawaitable(returned):
-                                await returned
+                        await _pass_feedback(handle, on_feedback, arguments.action.name)
                     return await handle.result()
         except TimeoutError as error:
             if not deadline.expired() or isinstance(error, CallError):
@@ -288,3 +289,20 @@ class Actions:
 
     def _new_goal(self) -> ActiveGoal:
         return ActiveGoal(uuid4(), self._loop.time())
+
+
+async def _pass_feedback(
+    goal: Goal[Any, Any], on_feedback: Callable[[Any], Any], name: str
+) -> None:
+    """Call a function with each feedback message of a goal, until that has ended."""
+    async for message in goal:
+        returned = on_feedback(message)
+        if returned is not None and inspect.isawaitable(returned):
+            await returned
+    if goal.feedback_dropped:
+        logger.warning(
+            "%s: %s of goal %s never reached on_feedback, which is too slow: let it return at once",
+            name,
+            count(goal.feedback_dropped, "feedback message"),
+            goal.id,
+        )

@@ -186,7 +186,8 @@ class ActionMethods:
             wait: False to fail at once if there is no server; or the number of seconds to wait for
                 one within ``accept_timeout``.
             on_feedback: ``on_feedback(feedback)``, plain or async, called for each feedback
-                message. If it raises, the goal is cancelled.
+                message. If it raises, the goal is cancelled. While it runs, up to 1,000 messages
+                wait; then the oldest are dropped, and a warning is logged.
 
         Raises:
             GoalRejected: the server did not accept the goal.
