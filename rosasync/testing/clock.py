@@ -41,7 +41,8 @@ class VirtualClock:
 
     Args:
         settle: real seconds to wait before each step, for responses from outside the process's
-            memory. 0 for a graph in memory, about 0.1 on real ROS.
+            memory. 0 for a graph in memory, about 0.1 on real ROS. A session with calls or goals
+            out looks at its context twice a second, so an hour takes 7,200 steps.
     """
 
     def __init__(self, settle: float = 0.0) -> None:
