@@ -225,6 +225,7 @@ def test_a_users_profile_that_may_have_come_too_late(
     environ.write_text(f"A=1\0{VARIABLE}={file}\0B=2")
     monkeypatch.setattr(configuration, "INITIAL_ENVIRONMENT", environ)
     assert configuration.heartbeats()
+    assert not configuration.heartbeats("service")
 
 
 OPEN = """

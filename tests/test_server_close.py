@@ -22,6 +22,7 @@ from rosasync import (
     UsageError,
 )
 from rosasync._core.ports import PortDestroyed
+from rosasync._ros.profile import HEARTBEAT, STOCK_HEARTBEAT, SWITCH
 from tests.support.checks import count_threads
 from tests.support.echo import ECHO
 from tests.support.serving import (
@@ -305,6 +306,30 @@ class TestLastResponses:
         assert not closing.done()
         received.set()
         await closing
+
+    async def test_and_repaired_if_they_were_lost(
+        self, session: Session, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("rosasync._server.sending.DELIVERY_TIME", 0.0)
+        server = session.serve(ECHO, "/served", echo_call)
+        received = asyncio.Event()
+        monkeypatch.setattr(server._port, "delivered", received.is_set)
+        monkeypatch.setattr(server._port, "repair_time", LIMIT)
+        assert await ask(session, "/served", "text") == "text"
+        closing = asyncio.create_task(server.aclose(None))
+        await asyncio.sleep(2 * TICK)
+        assert not closing.done()
+        received.set()
+        await closing
+
+    async def test_a_repair_takes_a_heartbeat_of_the_service(
+        self, session: Session, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        served = session.serve(ECHO, "/served", echo_call)
+        assert served._port.repair_time == HEARTBEAT
+        monkeypatch.setenv(SWITCH, "off")
+        other = session.serve(ECHO, "/other", echo_call)
+        assert other._port.repair_time == STOCK_HEARTBEAT
 
     async def test_the_deadline_ends_the_wait(
         self, session: Session, monkeypatch: pytest.MonkeyPatch

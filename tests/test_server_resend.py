@@ -84,7 +84,9 @@ class TestFaults:
             assert server.statistics().responded == 1
             assert await task == "text"
 
-    async def test_or_ends_it_after_the_deadline(self, fake_graph: FakeGraph) -> None:
+    async def test_or_ends_it_after_the_deadline(
+        self, fake_graph: FakeGraph, caplog: pytest.LogCaptureFixture
+    ) -> None:
         async with fake_graph.session() as session:
             holder = Holder()
             server = session.serve(ECHO, "/held", holder)
@@ -93,8 +95,9 @@ class TestFaults:
             (call,) = await holder.held(1)
             call.respond(echo_of(call.request))
             await server.aclose(0)
-            assert server.statistics().dropped == 1
-            assert server.statistics().unanswered == 0
+            assert server.statistics().undeliverable == 1
+            assert server.statistics().unanswered == server.statistics().dropped == 0
+            assert "#1 cannot be delivered: the server closes" in caplog.text
             with pytest.raises(ServerGone):
                 await task
 

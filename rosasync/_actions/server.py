@@ -331,13 +331,17 @@ class ActionServer(Generic[GoalT, ResultT, FeedbackT]):
         self._goals.flush()
         await self._feedback.wait()
         # An acceptance may wait to be sent again. Its client asks for the result afterwards.
-        *_, send_goal = self._services
+        *others, send_goal = self._services
+        last = self._loop.time() + CLOSE_TIMEOUT
         age = await send_goal.until_sent(CLOSE_TIMEOUT)
         await self._goals.until_asked(
             age, lambda: self._node.queries.count_clients(self._action.send_goal)
         )
         # Each waits until the clients have received its last responses.
-        await asyncio.gather(*(service.aclose(CLOSE_TIMEOUT) for service in self._services))
+        await asyncio.gather(
+            *(service.aclose(CLOSE_TIMEOUT) for service in others),
+            send_goal.aclose(max(0.0, last - self._loop.time())),
+        )
         self.end(functools.partial(SessionClosed, f"{self.action_name}: the server is closed"))
 
     def _destroy(self, ending: Callable[[], Exception]) -> None:

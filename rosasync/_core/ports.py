@@ -158,6 +158,10 @@ class ServicePort(Protocol):
         """Seconds to wait between `stop` and `close`, unless the server has to end at once."""
 
     @property
+    def repair_time(self) -> float:
+        """Seconds after which the middleware sends a lost response again."""
+
+    @property
     def destroyed(self) -> bool:
         """Whether something other than rosasync has destroyed the service."""
 

@@ -11,6 +11,8 @@ from xml.etree import ElementTree
 from rosasync._ros import fastdds
 from rosasync._ros.fresh_ports import fresh_offset
 from rosasync._ros.profile import (
+    HEARTBEAT,
+    STOCK_HEARTBEAT,
     is_old,
     missing_heartbeats,
     participant_text,
@@ -20,7 +22,7 @@ from rosasync._ros.profile import (
     user_profile,
 )
 
-__all__ = ["configure", "heartbeats"]
+__all__ = ["configure", "heartbeats", "repair_time"]
 
 logger = logging.getLogger("rosasync")
 
@@ -49,11 +51,20 @@ def configure(domain: int) -> None:
             )
 
 
-def heartbeats() -> bool:
-    """Return whether it is certain that new clients of this process send frequent heartbeats."""
+def heartbeats(kind: str = "client") -> bool:
+    """Return whether it is certain that new clients of this process send frequent heartbeats.
+
+    Args:
+        kind: ``"client"`` for the requests of clients, ``"service"`` for the responses of services.
+    """
     if user_profile(is_old()):
-        return _user_heartbeats()
+        return _user_heartbeats(kind)
     return _State.loaded and not switched_off()
+
+
+def repair_time() -> float:
+    """Return the seconds after which the middleware repairs a lost response of a new service."""
+    return HEARTBEAT if heartbeats("service") or not fastdds.is_present() else STOCK_HEARTBEAT
 
 
 class _State:
@@ -78,7 +89,7 @@ def _choose_port(domain: int) -> None:
         _State.offsets.add(offset)
 
 
-def _user_heartbeats() -> bool:
+def _user_heartbeats(kind: str) -> bool:
     """Return whether the user's profile sets them, and Fast DDS has read it.
 
     It reads profiles before the first participant of the process. If the variable was set after
@@ -87,7 +98,7 @@ def _user_heartbeats() -> bool:
     old = is_old()
     file, variable = user_profile(old), profile_variable(old)
     try:
-        if file is None or "client" in missing_heartbeats(file.read_text()):
+        if file is None or kind in missing_heartbeats(file.read_text()):
             return False
         started_with = INITIAL_ENVIRONMENT.read_bytes().split(b"\0")
     except (OSError, ValueError, ElementTree.ParseError):

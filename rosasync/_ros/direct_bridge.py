@@ -356,8 +356,9 @@ class DirectService:
         self._responder = Responder(node, service, self.qos)
         self.send = self._responder.send
         self.client_of = client_of
-        # Set by the node, which asks the graph.
+        # Set by the node, which asks the graph and knows the profile.
         self.identity: bytes | None = None
+        self.repair_time = 0.0
         self.clients = self._responder.clients
         self.has_clients = self._responder.has_clients
         self.delivered = self._responder.delivered

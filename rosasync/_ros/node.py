@@ -201,6 +201,7 @@ class RosNode:
                 deliver,
             )
             opened.identity = created()
+            opened.repair_time = configuration.repair_time()
         except RclpyError as error:
             raise refusal(self._node, service, "service", error) from error
         return opened

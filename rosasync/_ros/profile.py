@@ -18,6 +18,7 @@ from xml.etree import ElementTree
 
 __all__ = [
     "HEARTBEAT",
+    "STOCK_HEARTBEAT",
     "SWITCH",
     "is_old",
     "missing_heartbeats",
@@ -31,6 +32,8 @@ __all__ = [
 
 HEARTBEAT = 0.02
 """Seconds between the heartbeats of a writer with unacknowledged samples."""
+STOCK_HEARTBEAT = 3.0
+"""The same without the profile."""
 ANNOUNCEMENT = 0.2
 """Seconds between a process's announcements of itself, in a profile for every process."""
 SWITCH = "ROSASYNC_PROFILE"

@@ -14,9 +14,10 @@ if TYPE_CHECKING:
 
 __all__ = ["RESEND", "RESEND_TIME", "Resender", "Unsent"]
 
-RESEND = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 1.6, 1.6, 1.6, 1.6)
+RESEND = (0.05, 0.1, 0.2, 0.4, *[0.8] * 37)
 """Seconds to wait before each further attempt to send a response to a client that the middleware
-has not discovered completely."""
+has not discovered completely. It discovers it after 3, 6 or 9 s if packets of its discovery were
+lost, and a stock client waits for ever."""
 RESEND_TIME = 2 * sum(RESEND)
 """Seconds after which a response has been sent or given up, also on a machine with other work."""
 MAX_UNSENT = 1000
@@ -71,7 +72,7 @@ class Resender:
         self._unsent: dict[Unsent, None] = {}
 
     def add(self, unsent: Unsent) -> None:
-        """Repeat a response for about ten seconds. Beyond MAX_UNSENT, the oldest is given up.
+        """Repeat a response for about thirty seconds. Beyond MAX_UNSENT, the oldest is given up.
 
         Raises:
             RuntimeError: the loop is closed.
@@ -86,8 +87,8 @@ class Resender:
         unsent.due = self._loop.time() + RESEND[0]
         self._unsent[unsent] = None
         if idle:
-            # If the task is cancelled before it begins, it cannot clear them itself.
-            self._spawn(self._run(), self._unsent.clear)
+            # If the task is cancelled before it begins, it cannot abandon them itself.
+            self._spawn(self._run(), self._abandon)
 
     def has(self, header: RequestHeader) -> bool:
         """Return whether the response to a request waits to be sent again."""
@@ -104,7 +105,13 @@ class Resender:
                         return
                     await asyncio.sleep(0)
         finally:
-            self._unsent.clear()
+            self._abandon()
+
+    def _abandon(self) -> None:
+        """Give up those that are left when the end of the server cancels the task."""
+        for unsent in () if self._is_closed() else self._unsent:
+            self._give_up(unsent, "the server closes, and its client was not discovered before")
+        self._unsent.clear()
 
     def _settle(self, unsent: Unsent) -> bool:
         """Try once more to send a response; return whether the server is still open."""

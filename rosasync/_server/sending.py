@@ -28,8 +28,8 @@ __all__ = ["COLLECTED", "ResponseSender", "service_destroyed"]
 logger = logging.getLogger("rosasync")
 
 DELIVERY_TIME = 0.5
-"""Maximum number of seconds between a response and the end of its service that it delays. Repairs
-of lost packets take several of the middleware's heartbeats (20 ms, or 3 s by its own default)."""
+"""Maximum number of seconds between a response and the end of its service that it delays, beside
+the time after which the middleware repairs a lost packet (20 ms, or 3 s by its own default)."""
 DELIVERY_INTERVAL = 0.01
 """Seconds between two queries whether the last responses were received."""
 
@@ -192,12 +192,14 @@ class ResponseSender(Generic[ResponseT]):
         """Wait until the clients have received the last responses, or may be expected to have.
 
         The middleware drops what is not received yet when its service is destroyed. Responses that
-        are older than `DELIVERY_TIME` are not waited for: their clients may have been killed.
+        are older than `DELIVERY_TIME` and a repair are not waited for: their clients may have been
+        killed.
 
         Args:
             timeout: maximum number of seconds to wait.
         """
-        until = min(self._last_sent + DELIVERY_TIME, monotonic() + timeout)
+        longest = DELIVERY_TIME + self._port.repair_time
+        until = min(self._last_sent + longest, monotonic() + timeout)
         with suppress(ContextShutdown, PortDestroyed):
             while monotonic() < until and self._is_undelivered():  # noqa: ASYNC110
                 await asyncio.sleep(DELIVERY_INTERVAL)

@@ -247,8 +247,9 @@ class ServiceServer(Generic[RequestT, ResponseT]):
         It stops taking requests, and lets the handlers finish, also those of waiting requests, for
         ``timeout`` seconds (None: without a limit). Then it cancels the rest and destroys the
         service. Calls that are still unanswered stay unanswered. If it has responded within the
-        last half second, it first waits that long at most, within the timeout, until the clients
-        have received the responses. Otherwise the middleware would drop them with the service.
+        last half second (3.5 s without the profile of rosasync), it first waits that long at most,
+        within the timeout, until the clients have received the responses. Otherwise the middleware
+        would drop them with the service.
 
         A handler may close its server, or its session, itself or in a task that it starts. It is
         then neither waited for nor cancelled, and should have responded before.

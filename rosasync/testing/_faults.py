@@ -122,6 +122,11 @@ class FaultyService:
         return self._port.destroy_delay
 
     @property
+    def repair_time(self) -> float:
+        """Seconds after which the middleware sends a lost response again."""
+        return self._port.repair_time
+
+    @property
     def destroyed(self) -> bool:
         """Whether something other than rosasync has destroyed the service."""
         return self._port.destroyed

@@ -156,6 +156,7 @@ class MemoryService(MemoryServer):
     handle = None
     qos = None
     destroy_delay = 0.0
+    repair_time = 0.0
     destroyed = False
 
     def __init__(
