@@ -280,6 +280,10 @@ class TestClose:
         """As pytest's ``filterwarnings = error`` makes it."""
         raised: list[Any] = []
         monkeypatch.setattr("sys.unraisablehook", lambda hook: raised.append(hook.exc_type))
+        # The middleware starts some threads once, and keeps them.
+        async with Session("first", bridge=bridge) as first:
+            first.serve(ECHO, "/served", echo_call)
+            assert await ask(first, "/served", "text") == "text"
         before = count_threads()
         session = Session("dropped", bridge=bridge)
         await session.__aenter__()
