@@ -311,8 +311,9 @@ class TestFeedback:
             goal.feedback({"sequence": [2]})
             with pytest.raises(ValueError, match="sequenze"):
                 goal.feedback({"sequenze": [2]})
-            with pytest.raises(TypeError):
-                goal.feedback(Fibonacci.Result())
+            for wrong in (Fibonacci.Result(), None):
+                with pytest.raises(TypeError):
+                    goal.feedback(wrong)
             # A stock client drops the feedback that it has not taken before the result.
             await received.wait()
             return fibonacci(0)

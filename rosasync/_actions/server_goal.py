@@ -98,6 +98,8 @@ class ServerGoal(Generic[GoalT, FeedbackT]):
             UsageError: the goal has ended.
             SessionClosed, ContextShutdown: the server has ended.
         """
+        if message is None:
+            raise TypeError("feedback is a message or a mapping of its fields, not None")
         if self._record.ended:
             raise UsageError(
                 f"{self.server.action_name}: goal {self.id} has ended "
