@@ -17,8 +17,10 @@ from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 from rclpy.waitable import NumberOfEntities, Waitable
 from std_msgs.msg import Empty
+from test_msgs.action import Fibonacci
 
-from rosasync import Limits, Session
+from rosasync import Limits, ServerGoal, Session
+from rosasync._ros.topics import ExecutorSubscription
 from tests.support.checks import assert_clean, check_call
 from tests.support.times import LIMIT, TICK, until
 
@@ -256,6 +258,32 @@ class TestBorrowed:
             executor.create_task(asyncio.get_running_loop().call_soon_threadsafe, ticked.set)
             async with asyncio.timeout(LIMIT):
                 await ticked.wait()
+
+    async def test_several_threads_do_not_let_a_result_overtake_feedback(
+        self, context: Any, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        take_next = ExecutorSubscription._take_next
+
+        def take_slowly(subscription: ExecutorSubscription) -> Any:
+            threading.Event().wait(TICK)
+            return take_next(subscription)
+
+        async def count(goal: ServerGoal[Any, Any]) -> Any:
+            for number in range(goal.request.order):
+                goal.feedback({"sequence": [number]})
+            return {}
+
+        monkeypatch.setattr(ExecutorSubscription, "_take_next", take_slowly)
+        executor = MultiThreadedExecutor(4, context=context)
+        with spinning(executor):
+            async with Session("server") as server, guest("executor", executor) as session:
+                server.serve_action(Fibonacci, "/count", count)
+                # For a new client, the server waits until the first feedback has arrived.
+                for _ in range(2):
+                    async with session.goal(Fibonacci, "/count", {"order": 3}) as goal:
+                        await goal.result(timeout=LIMIT)
+                        received = [message.sequence[0] async for message in goal]
+                    assert received == [0, 1, 2]
 
     async def test_an_executor_that_nothing_spins(self, bridge: Bridge, context: Any) -> None:
         executor = SingleThreadedExecutor(context=context)

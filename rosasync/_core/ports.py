@@ -63,6 +63,7 @@ class Service:
         key: the key of the service in the pool.
         fits: whether a value is a request that can be sent as it is.
         in_flight: the most requests that a client has outstanding, if it is not the session's.
+        after_topics: whether a response must not overtake messages of topics that arrived before.
     """
 
     srv_type: Any
@@ -71,6 +72,7 @@ class Service:
     key: ServiceKey
     fits: Callable[[Any], bool] = field(compare=False, repr=False)
     in_flight: int = 0
+    after_topics: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,7 @@ from rosasync._ros.rcl import Rcl
 from rosasync._ros.responder import Responder, client_of
 from rosasync._ros.services import make_service, qos_of, take_requests
 from rosasync._ros.signals import PacedSignal, Signal, Signals
-from rosasync._ros.topics import DirectSubscription, take_messages
+from rosasync._ros.topics import NO_SUBSCRIPTION_EVENTS, DirectSubscription, take_messages
 from rosasync.errors import RosasyncError
 
 __all__ = ["DESTROY_DELAY", "DirectBridge", "DirectCallbackGroup"]
@@ -78,8 +78,13 @@ class DirectBridge:
         # What destroys an entity, with its timer that runs after DESTROY_DELAY, or `close` sooner.
         self._retired: dict[Callable[[], object], asyncio.TimerHandle] = {}
 
-    def open_client(self, srv_type: Any, srv_name: str, qos: Any, deliver: Deliver) -> DirectClient:
-        """Create a client that passes its responses to ``deliver`` on the loop's thread."""
+    def open_client(
+        self, srv_type: Any, srv_name: str, qos: Any, deliver: Deliver, after_topics: bool
+    ) -> DirectClient:
+        """Create a client that passes its responses to ``deliver`` on the loop's thread.
+
+        They may overtake messages of topics until `DirectSubscription.drain` is called.
+        """
         client = self._node.create_client(
             srv_type, srv_name, qos_profile=qos, callback_group=self._group
         )
@@ -109,7 +114,13 @@ class DirectBridge:
     ) -> DirectSubscription:
         """Create a subscription that passes its messages to ``deliver`` on the loop's thread."""
         subscription = self._node.create_subscription(
-            msg_type, topic_name, _ignore_message, qos, callback_group=self._group, raw=raw
+            msg_type,
+            topic_name,
+            _ignore_message,
+            qos,
+            callback_group=self._group,
+            event_callbacks=NO_SUBSCRIPTION_EVENTS,
+            raw=raw,
         )
         try:
             signals = self._raw_subscriptions if raw else self._subscriptions

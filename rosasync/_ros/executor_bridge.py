@@ -17,7 +17,7 @@ from rosasync._core.ports import Deliver, DeliverMessage, DeliverRequest, Reques
 from rosasync._ros.failures import RclpyError, explain, is_destroyed
 from rosasync._ros.responder import Responder, client_of
 from rosasync._ros.services import make_service, qos_of, take_request
-from rosasync._ros.topics import ExecutorSubscription
+from rosasync._ros.topics import NO_SUBSCRIPTION_EVENTS, ExecutorSubscription
 from rosasync.errors import RosasyncError, SessionClosed
 
 __all__ = ["ExecutorBridge"]
@@ -38,17 +38,19 @@ class ExecutorBridge:
         self._gateway = gateway
         # A group for the clients alone, so that no other callback of the node delays them.
         self._group = ReentrantCallbackGroup()
+        # One for all subscriptions, and for the clients whose responses come after their messages.
+        # It keeps them in order in a MultiThreadedExecutor, which looks at subscriptions first.
+        self._ordered = MutuallyExclusiveCallbackGroup()
         self._clients: dict[ExecutorClient, None] = {}
         self._services: dict[ExecutorService, None] = {}
         self._subscriptions: dict[ExecutorSubscription, None] = {}
 
     def open_client(
-        self, srv_type: Any, srv_name: str, qos: Any, deliver: Deliver
+        self, srv_type: Any, srv_name: str, qos: Any, deliver: Deliver, after_topics: bool
     ) -> ExecutorClient:
         """Create a client that passes its responses to ``deliver`` on the loop's thread."""
-        client = self._node.create_client(
-            srv_type, srv_name, qos_profile=qos, callback_group=self._group
-        )
+        group = self._ordered if after_topics else self._group
+        client = self._node.create_client(srv_type, srv_name, qos_profile=qos, callback_group=group)
         try:
             self._configure(client)
         except BaseException:
@@ -84,10 +86,14 @@ class ExecutorBridge:
     ) -> ExecutorSubscription:
         """Create a subscription that passes its messages to ``deliver`` on the loop's thread."""
         opened = ExecutorSubscription(self._node, self._gateway, deliver, self._subscriptions.pop)
-        # A group of its own keeps the messages in order in a MultiThreadedExecutor.
-        group = MutuallyExclusiveCallbackGroup()
         subscription = self._node.create_subscription(
-            msg_type, topic_name, opened.take, qos, callback_group=group, raw=raw
+            msg_type,
+            topic_name,
+            opened.take,
+            qos,
+            callback_group=self._ordered,
+            event_callbacks=NO_SUBSCRIPTION_EVENTS,
+            raw=raw,
         )
         opened.begin(subscription)
         self._subscriptions[opened] = None

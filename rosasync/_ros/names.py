@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from typing import Any
 
 from rclpy.exceptions import InvalidServiceNameException, InvalidTopicNameException
@@ -75,7 +76,11 @@ def describe_action(node: Node, wanted: Any, action_name: str) -> Action:
         type_name(action_class),
         describe(node, implementation.SendGoalService, f"{action_name}{SEND_GOAL}", None),
         describe(node, implementation.CancelGoalService, f"{prefix}/cancel_goal", None),
-        describe(node, implementation.GetResultService, f"{prefix}/get_result", None),
+        # The feedback comes before the result.
+        replace(
+            describe(node, implementation.GetResultService, f"{prefix}/get_result", None),
+            after_topics=True,
+        ),
         f"{prefix}/feedback",
         f"{prefix}/status",
     )

@@ -35,7 +35,7 @@ from rosasync._ros.held_node import HeldNode
 from rosasync._ros.identities import Identities
 from rosasync._ros.messages import make_message
 from rosasync._ros.node_events import NodeEvents
-from rosasync._ros.topics import Publisher, qos_profile
+from rosasync._ros.topics import NO_PUBLISHER_EVENTS, Publisher, qos_profile
 from rosasync._ros.types import type_name
 from rosasync.errors import ContextShutdown
 from rosasync.options import SessionOptions
@@ -182,6 +182,7 @@ class RosNode:
                 service.srv_name,
                 _qos_of(service, _client_depth(service, self._in_flight)),
                 deliver,
+                service.after_topics,
             )
             client.identity = self._identities.confirm(
                 client.handle, service.key.srv_name, created()
@@ -209,7 +210,9 @@ class RosNode:
     def open_publisher(self, msg_type: Any, topic_name: str, qos: TopicQos) -> PublisherPort:
         """Create a publisher."""
         try:
-            publisher = self._node.create_publisher(msg_type, topic_name, qos_profile(qos))
+            publisher = self._node.create_publisher(
+                msg_type, topic_name, qos_profile(qos), event_callbacks=NO_PUBLISHER_EVENTS
+            )
         except RclpyError as error:
             raise topic_refusal(self._node, topic_name, error) from error
         opened = Publisher(self._node, publisher, self._publishers.pop)

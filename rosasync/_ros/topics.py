@@ -8,6 +8,7 @@ from functools import partial
 from typing import Any
 
 from rclpy.duration import Duration
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 from rclpy.qos import (
@@ -26,6 +27,8 @@ from rosasync._ros.signals import Signal, Signals
 from rosasync.errors import RosasyncError
 
 __all__ = [
+    "NO_PUBLISHER_EVENTS",
+    "NO_SUBSCRIPTION_EVENTS",
     "DirectSubscription",
     "ExecutorSubscription",
     "Publisher",
@@ -37,6 +40,11 @@ logger = logging.getLogger("rosasync")
 
 BATCH = 200
 """Maximum number of messages taken at a time, so that a flood does not hold up the loop."""
+
+NO_PUBLISHER_EVENTS = PublisherEventCallbacks(use_default_callbacks=False)
+NO_SUBSCRIPTION_EVENTS = SubscriptionEventCallbacks(use_default_callbacks=False)
+"""rclpy's default is a waitable for each event. An executor that is just waiting for it raises
+InvalidHandle in ``spin`` when the publisher or subscription is destroyed."""
 
 
 def qos_profile(qos: TopicQos) -> QoSProfile:
