@@ -30,10 +30,8 @@ _PROFILE_VARIABLE = (
 )
 
 # Every test opens new sessions. A process that announces itself twice a second instead of every
-# 3 s is found at once, even by a session that replaces another. Not more often: Fast DDS can
-# deadlock if an announcement is due while a peer's endpoint is removed
-# (https://github.com/eProsima/Fast-DDS/issues/6502). A response waits up to 3 s for its client to
-# be matched: if a discovery packet is lost, the usual 0.1 s is not enough.
+# 3 s is found at once, even by a session that replaces another. A response waits up to 3 s for its
+# client to be matched: if a discovery packet is lost, the usual 0.1 s is not enough.
 _PROFILE = """<?xml version="1.0" encoding="UTF-8" ?>
 <profiles xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
   <participant profile_name="child" is_default_profile="true"><rtps><builtin><discovery_config>
@@ -47,8 +45,17 @@ _PROFILE = """<?xml version="1.0" encoding="UTF-8" ?>
 """
 
 
+LEASE = 600
+"""Seconds after which others notice that a child was killed, unless its test wants it sooner. Not
+the usual 20: Fast DDS looks at each other process whenever a lease of it has passed, and deadlocks
+if it is removing an endpoint at that moment, as it does when a test ends its session
+(https://github.com/eProsima/Fast-DDS/issues/6502). The stacks of a stock process that answered no
+more, in one of nine runs of its module beside load, showed that.
+"""
+
+
 @contextmanager
-def profile(lease: int = 20) -> Iterator[dict[str, str]]:
+def profile(lease: int = LEASE) -> Iterator[dict[str, str]]:
     """Write the middleware's profile for a child; yield the variable that names it."""
     with TemporaryDirectory() as folder:
         file = Path(folder) / "profile.xml"
@@ -99,7 +106,7 @@ class NodeProcess(Child):
     stock = True
     """Whether it runs stock rclpy only, which may hang in the middleware when the process ends."""
 
-    def __init__(self, *args: str, lease: int = 20, **options: Any) -> None:
+    def __init__(self, *args: str, lease: int = LEASE, **options: Any) -> None:
         self._lease = lease
         super().__init__(self.module, *args, **options)
 
