@@ -233,7 +233,8 @@ async def test_waiting_requests_of_callers_that_left_are_not_run(world: World) -
     for call in calls[1::2]:
         call.cancel()
     await until(lambda: server.statistics().abandoned == 10)
-    assert world.client.pool.statistics().abandoned == 0
+    # The client learns later than the server that their places are free.
+    await until(lambda: world.client.pool.statistics().abandoned == 0)
     gate.set()
     answers = await asyncio.gather(*calls[::2])
     assert [answer_to(response) for response in answers] == [str(n) for n in range(0, 20, 2)]
@@ -485,6 +486,8 @@ class TestVerify:
         asked: list[int] = []
 
         async def verify() -> Any:
+            # On a busy machine the request may take longer than the time after which it is asked.
+            await holder.held(1)
             asked.append(len(holder.calls))
             return echo_of(request_of("had run"))
 
@@ -539,7 +542,7 @@ class TestVerify:
 
         await world.serve(Holder())
         with pytest.raises(ResponseTimeout):
-            await world.call(timeout=0.2, retry=Retry(after=0.05, verify=verify))
+            await world.call(timeout=1.0, retry=Retry(after=0.05, verify=verify))
         await until(lambda: bool(cancelled))
 
     def test_it_must_be_callable(self) -> None:
