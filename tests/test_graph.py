@@ -44,7 +44,10 @@ async def seen(session: Session, name: str) -> None:
         if "stock_server" not in session.node.get_node_names():
             return False
         services = session.node.get_service_names_and_types_by_node("stock_server", "/")
-        return name in [service for service, _ in services]
+        # The node's list and the endpoints arrive by different topics.
+        return (
+            name in [service for service, _ in services] and session.node.count_services(name) > 0
+        )
 
     await until(listed)
 

@@ -100,7 +100,10 @@ def test_malformed_name_says_the_form(name: str) -> None:
         ("std_srvs/SetBool", "; did you mean 'std_srvs/srv/SetBool'?"),
         ("std_srvs.srv.SetBool", "; did you mean 'std_srvs/srv/SetBool'?"),
         ("SetBool", "'std_srvs/srv/SetBool'"),
-        ("test_msgs/action/Fibonacci", "'std_srvs/srv/SetBool'"),
+        (
+            "test_msgs/action/Fibonacci",
+            "; it is an action, for session.act and session.serve_action",
+        ),
     ],
 )
 def test_malformed_name_says_what_was_meant(name: str, meant: str) -> None:

@@ -428,7 +428,7 @@ def test_what_rcl_refuses_is_named(middleware: Middleware, monkeypatch: pytest.M
 
 
 def test_a_server_tries_for_longer_than_it_watches() -> None:
-    assert LIMIT > sum(RESEND) > WATCH_TIME
+    assert sum(RESEND) > WATCH_TIME
 
 
 def test_what_is_no_header_of_rclpy_has_no_identity() -> None:
