@@ -15,12 +15,14 @@ from typing import Any
 
 from tests.support.child import serve_commands
 
-__all__ = ["CALL", "HELD", "NAME", "SLOWLY"]
+__all__ = ["CALL", "HELD", "NAME", "RESULT_TIMEOUT", "SLOWLY"]
 
 NAME = "/bench/action"
 CALL = "/bench/action_call"
 SLOWLY = 1_000_000
 HELD = -1
+RESULT_TIMEOUT = 10.0
+"""Seconds for which a server keeps results."""
 
 
 def plan(order: int) -> tuple[int, float]:
@@ -55,7 +57,7 @@ def serve_stock() -> None:
         execute,
         callback_group=ReentrantCallbackGroup(),
         cancel_callback=lambda goal: CancelResponse.ACCEPT,
-        result_timeout=10,
+        result_timeout=int(RESULT_TIMEOUT),
     )
     threading.Thread(target=executor.spin, daemon=True).start()
     serve_commands({})
@@ -80,7 +82,9 @@ async def serve_ours() -> None:
         return Fibonacci.Result()
 
     async with rosasync.Session("bench_action_server") as session:
-        session.serve_action(Fibonacci, NAME, execute, concurrency=2000, result_timeout=10.0)
+        session.serve_action(
+            Fibonacci, NAME, execute, concurrency=2000, result_timeout=RESULT_TIMEOUT
+        )
         session.serve(Trigger, CALL, lambda request, response: response)
         await asyncio.to_thread(serve_commands, {})
 
