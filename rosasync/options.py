@@ -7,7 +7,6 @@ import math
 import numbers
 import operator
 from collections.abc import Awaitable, Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, SupportsFloat, SupportsIndex, TypeVar
 
@@ -113,10 +112,11 @@ def check_hook(name: str, hook: HookT, *arguments: str) -> HookT:
         return hook
     if not callable(hook):
         raise TypeError(f"{name} must be callable, not {type(hook).__name__}")
-    # ValueError: some functions of C have no signature.
-    with suppress(ValueError):
+    if arguments:
         try:
-            inspect.signature(hook).bind(*arguments) if arguments else None
+            inspect.signature(hook).bind(*arguments)
+        except ValueError:
+            pass  # Some functions of C have no signature.
         except TypeError:
             shape = f"{name}({', '.join(arguments)})"
             raise TypeError(f"{name} is called as {shape}, and {hook!r} cannot be") from None

@@ -42,15 +42,14 @@ class _Goal:
         request: the request that was answered with the acceptance.
         until: the loop time until which its feedback may be held back.
         messages: the feedback that is held back.
-        has_feedback: whether it has any.
-        matched_at: the loop time since which its client is matched, or not waited for.
+        matched_at: the loop time since which its client is matched, or not waited for. None until
+            some feedback may be sent.
         then: sends its result, once it has ended.
     """
 
     request: ServiceCall[Any, Any]
     until: float
     messages: deque[Any] = field(default_factory=deque)
-    has_feedback: bool = False
     matched_at: float | None = None
     then: Callable[[], None] | None = None
 
@@ -85,7 +84,7 @@ class FeedbackSender:
         # The clients that get messages at once. Only until the graph changes: a client of rosasync
         # makes a new subscription if its last goal was some time ago.
         self._reached: dict[Hashable, None] = {}
-        # Those that were waited for in vain. Some have no subscription at all.
+        # Those that were not matched in time. Some have no subscription at all.
         self._unreachable: dict[Hashable, None] = {}
         self._goals: dict[bytes, _Goal] = {}
         # Runs while messages are held back, or a result.
@@ -109,7 +108,6 @@ class FeedbackSender:
         if goal is None:
             self._publish(message)
             return
-        goal.has_feedback = True
         if goal.messages or not self._may_send(goal):
             goal.messages.append(deepcopy(message))
             self._poll_soon()
@@ -151,7 +149,7 @@ class FeedbackSender:
         if not goal.messages:
             if goal.then is None:
                 return
-            if not goal.has_feedback or self._is_settled(goal):
+            if goal.matched_at is None or self._is_settled(goal):
                 self._goals.pop(goal_id, None)
                 goal.then()
                 return
