@@ -297,28 +297,21 @@ class TestClose:
 
 
 class TestLastResponses:
+    @pytest.mark.parametrize(("delivery", "repair"), [(LIMIT, None), (0.0, LIMIT)])
     async def test_the_end_waits_until_they_are_received(
-        self, session: Session, monkeypatch: pytest.MonkeyPatch
+        self,
+        session: Session,
+        monkeypatch: pytest.MonkeyPatch,
+        delivery: float,
+        repair: float | None,
     ) -> None:
-        monkeypatch.setattr("rosasync._server.sending.DELIVERY_TIME", LIMIT)
+        """Also if they were lost, and have to be repaired."""
+        monkeypatch.setattr("rosasync._server.sending.DELIVERY_TIME", delivery)
         server = session.serve(ECHO, "/served", echo_call)
         received = asyncio.Event()
         monkeypatch.setattr(server._port, "delivered", received.is_set)
-        assert await ask(session, "/served", "text") == "text"
-        closing = asyncio.create_task(server.aclose(None))
-        await asyncio.sleep(2 * TICK)
-        assert not closing.done()
-        received.set()
-        await closing
-
-    async def test_and_repaired_if_they_were_lost(
-        self, session: Session, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setattr("rosasync._server.sending.DELIVERY_TIME", 0.0)
-        server = session.serve(ECHO, "/served", echo_call)
-        received = asyncio.Event()
-        monkeypatch.setattr(server._port, "delivered", received.is_set)
-        monkeypatch.setattr(server._port, "repair_time", LIMIT)
+        if repair is not None:
+            monkeypatch.setattr(server._port, "repair_time", repair)
         assert await ask(session, "/served", "text") == "text"
         closing = asyncio.create_task(server.aclose(None))
         await asyncio.sleep(2 * TICK)
