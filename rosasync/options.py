@@ -65,15 +65,19 @@ def check_timeout(value: Timeout, default: float | None, name: str = "timeout") 
     return None if seconds == math.inf else max(0.0, seconds)
 
 
-def check_wait(value: object) -> None:
-    """Check whether, or for how many seconds, to wait for a server.
+def check_wait(value: bool | SupportsFloat) -> bool | float:
+    """Return whether, or for how many seconds, to wait for a server.
+
+    Zero and a negative number give False, as with `check_timeout`: no time is left.
 
     Raises:
         TypeError: it is neither a bool nor a number.
         ValueError: it is not a number (NaN), or too large for a float.
     """
-    if not isinstance(value, bool):
-        _as_float("wait", value, "True, False or a number of seconds")  # type: ignore[arg-type]
+    if isinstance(value, bool):
+        return value
+    seconds = _as_float("wait", value, "True, False or a number of seconds")
+    return seconds if seconds > 0 else False
 
 
 def check_count(name: str, value: SupportsIndex, least: int) -> int:

@@ -169,6 +169,8 @@ async def test_without_time_nothing_is_sent(
             await session.act(Fibonacci, "/nothing", **options)
     with pytest.raises(GoalTimeout, match=text):
         await block(session, Fibonacci, NAME, None, accept_timeout=seconds)
+    with pytest.raises(ServiceUnavailable, match="/nothing: no action server"):
+        await session.act(Fibonacci, "/nothing", wait=seconds)
     await asyncio.sleep(TICK)
     assert len(server.requests) == 1
     assert session.core.actions.out == 0

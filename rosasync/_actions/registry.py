@@ -118,10 +118,7 @@ class Actions:
         action = self.describe(action_type, action_name)
         message = self._node.make_message(action.action_type.Goal, goal)
         seconds = check_timeout(accept_timeout, self._timeout, "accept_timeout")
-        check_wait(wait)
-        if not isinstance(wait, bool):
-            wait = check_seconds("wait", wait)
-        return ActArguments(action, message, seconds, wait)
+        return ActArguments(action, message, seconds, check_wait(wait))
 
     async def act(
         self,
