@@ -18,7 +18,7 @@ import yaml
 
 from tests.support.action_clients import ActionClientProcess, Ended
 from tests.support.action_servers import ActionServerProcess, none_runs
-from tests.support.command import LIMIT, json_lines, rosasync, terminal
+from tests.support.command import DISCOVERY, LIMIT, json_lines, rosasync, terminal
 from tests.support.process import ROOT, ended
 
 pytestmark = pytest.mark.slow
@@ -81,7 +81,7 @@ class TestGraph:
         done = rosasync("action", "type", "/cli/none", "--timeout", "0.5")
         assert (done.returncode, done.stdout) == (3, "")
         assert "no server of this name within 0.5 s. Try: rosasync action list" in done.stderr
-        done = rosasync("action", "type", f"{QUICK}_", "--timeout", "0.5")
+        done = rosasync("action", "type", f"{QUICK}_", "--timeout", DISCOVERY)
         assert f"; there are {QUICK} ({FIBONACCI}). Try: rosasync action list" in done.stderr
 
     def test_info(self) -> None:
@@ -91,10 +91,11 @@ class TestGraph:
         assert "clients: 0" in done.stdout
         (server,) = json_lines(rosasync("action", "info", QUICK, "--json").stdout)
         assert (server["role"], server["type"]) == ("server", FIBONACCI)
-        done = rosasync("action", "info", f"{QUICK}_")
+        done = rosasync("action", "info", f"{QUICK}_", "--wait", DISCOVERY)
         assert done.returncode == 3
         assert f"; there are {QUICK} ({FIBONACCI})" in done.stderr
-        assert f"{QUICK}: no server of this name; it is an action" in rosasync("info", QUICK).stderr
+        done = rosasync("info", QUICK, "--wait", DISCOVERY)
+        assert f"{QUICK}: no server of this name; it is an action" in done.stderr
 
 
 @pytest.mark.usefixtures("quick")

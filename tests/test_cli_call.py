@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from tests.support.command import LAMP, LAMP_TYPE, json_lines, rosasync, terminal
+from tests.support.command import DISCOVERY, LAMP, LAMP_TYPE, json_lines, rosasync, terminal
 from tests.support.process import ROOT, ended, own
 from tests.support.servers import ServerProcess
 from tests.support.times import LIMIT
@@ -121,9 +121,12 @@ def test_template_is_a_request_to_edit_and_send() -> None:
         pytest.param((LAMP, "--field", "nothing"), 2, "there is success, message", id="path"),
         pytest.param(("/lamp/none", LAMP_TYPE, "--timeout", "1"), 3, "rosasync why", id="none"),
         pytest.param(
-            ("/lamp/swich", "--timeout", "1"), 3, f"there are {LAMP} ({LAMP_TYPE})", id="no type"
+            ("/lamp/swich", "--timeout", DISCOVERY),
+            3,
+            f"there are {LAMP} ({LAMP_TYPE})",
+            id="no type",
         ),
-        pytest.param(("/lamp/silent", "--timeout", "3"), 4, "--timeout", id="timeout"),
+        pytest.param(("/lamp/silent", "--timeout", DISCOVERY), 4, "--timeout", id="timeout"),
     ],
 )
 def test_a_failure_has_an_exit_code_and_one_line(
@@ -137,7 +140,7 @@ def test_a_failure_has_an_exit_code_and_one_line(
 
 @pytest.mark.slow
 def test_another_type_is_a_warning_before_it_is_an_error() -> None:
-    done = rosasync("call", LAMP, "std_srvs/srv/Trigger", "--timeout", "4")
+    done = rosasync("call", LAMP, "std_srvs/srv/Trigger", "--timeout", DISCOVERY)
     assert done.returncode == 3
     warning, error = done.stderr.splitlines()
     assert "callers wait for a server of type std_srvs/srv/Trigger" in warning
@@ -146,7 +149,8 @@ def test_another_type_is_a_warning_before_it_is_an_error() -> None:
 
 @pytest.mark.slow
 def test_failures_of_several_calls_are_counted_by_kind() -> None:
-    done = rosasync("call", "/lamp/silent", LAMP_TYPE, "--count", "2", "--timeout", "3", "--json")
+    options = ("--count", "2", "--timeout", DISCOVERY, "--json")
+    done = rosasync("call", "/lamp/silent", LAMP_TYPE, *options)
     assert done.returncode == 4
     first, _, summary = json_lines(done.stdout)
     assert first["error"]["kind"] == "ResponseTimeout"

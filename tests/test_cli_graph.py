@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from rosasync._ros.middleware import installed_middlewares
-from tests.support.command import LAMP, LAMP_TYPE, json_lines, rosasync, terminal
+from tests.support.command import DISCOVERY, LAMP, LAMP_TYPE, json_lines, rosasync, terminal
 
 PROFILE, OTHER_PROFILE = "FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"
 if not version("rclpy").startswith("7."):
@@ -44,10 +44,10 @@ def test_type_and_find() -> None:
     wrong = rosasync("find", f"{LAMP_TYPE}l")
     assert (wrong.returncode, wrong.stdout) == (2, "")
     assert f"did you mean '{LAMP_TYPE}'" in wrong.stderr
-    missing = rosasync("type", "/lamp/swich", "--timeout", "1")
+    missing = rosasync("type", "/lamp/swich", "--timeout", DISCOVERY)
     assert (missing.returncode, missing.stdout) == (3, "")
     assert f"there are {LAMP} ({LAMP_TYPE})" in missing.stderr
-    missing = rosasync("info", "/lamp/swich")
+    missing = rosasync("info", "/lamp/swich", "--wait", DISCOVERY)
     assert (missing.returncode, missing.stdout) == (3, "/lamp/swich\nservers: 0\nclients: 0\n")
     assert f"there are {LAMP} ({LAMP_TYPE})" in missing.stderr
 
@@ -83,13 +83,13 @@ def test_nodes() -> None:
         ),
         pytest.param(("/lamp/none", "--timeout", "1"), 3, {"graph": False}, id="graph"),
         pytest.param(
-            (LAMP, "std_srvs/srv/Trigger", "--timeout", "1"),
+            (LAMP, "std_srvs/srv/Trigger", "--timeout", DISCOVERY),
             3,
             {"graph": True, "matched": False},
             id="matched",
         ),
         pytest.param(
-            ("/lamp/silent", "--request", "{}", "--timeout", "3"),
+            ("/lamp/silent", "--request", "{}", "--timeout", DISCOVERY),
             4,
             {"graph": True, "matched": True, "answered": False},
             id="answered",

@@ -18,7 +18,7 @@ from rosasync import ServiceCall, Session
 from rosasync._cli.param_values import read_value
 from rosasync._core.safe_yaml import YamlError
 from rosasync.parameters import ParameterType
-from tests.support.command import rosasync
+from tests.support.command import DISCOVERY, rosasync
 from tests.support.managed import NodesProcess
 from tests.support.process import ROOT, own
 from tests.support.times import LIMIT, TICK
@@ -59,11 +59,11 @@ class TestParam:
 
     async def test_a_node_that_is_not_there(self, nodes: NodesProcess) -> None:
         node = await nodes.add("parameters", "arm")
-        done = await run("param", "get", f"{node}m", "bool", "--timeout", "3")
+        done = await run("param", "get", f"{node}m", "bool", "--timeout", DISCOVERY)
         assert (done.returncode, done.stdout) == (3, "")
         assert f"{node}m: no node of this name after" in done.stderr
         assert f"; there are {node}" in done.stderr
-        done = await run("lifecycle", "get", node, "--timeout", "3")
+        done = await run("lifecycle", "get", node, "--timeout", DISCOVERY)
         assert (done.returncode, done.stdout) == (3, "")
         assert f"{node}: this node has no lifecycle" in done.stderr
 
@@ -110,14 +110,14 @@ class TestParam:
 
     async def test_one_silent_node_of_several(self, nodes: NodesProcess) -> None:
         other = await nodes.add("unset")
-        timeout = ("--timeout", str(40 * TICK))
+        options = ("--timeout", DISCOVERY, "--wait", DISCOVERY)
         async with (
             Session("its_host") as session,
             session.serve("rcl_interfaces/srv/ListParameters", "/silent/list_parameters", hang),
             session.serve("lifecycle_msgs/srv/GetState", "/silent/get_state", hang),
         ):
-            listed = await run("param", "list", *timeout)
-            states = await run("lifecycle", "nodes", *timeout)
+            listed = await run("param", "list", *options)
+            states = await run("lifecycle", "nodes", *options)
         assert f"{other}:\n  first\n" in listed.stdout
         assert "/silent:" not in listed.stdout
         assert "/silent/list_parameters" in listed.stderr
@@ -309,7 +309,7 @@ class TestLifecycle:
             (("set", failing, "activate"), 1, "it is unconfigured"),
             (("set", failing, "explode"), 2, "'transition': 'explode' is not one of"),
             (("get", "/absent", "--timeout", str(TICK)), 3, "/absent"),
-            (("set", slow, "configure", "--timeout", str(60 * TICK)), 4, "(unknown)"),
+            (("set", slow, "configure", "--timeout", DISCOVERY), 4, "(unknown)"),
         ):
             done = await run("lifecycle", *arguments)
             assert (done.returncode, done.stdout) == (code, ""), (arguments, done.stderr)

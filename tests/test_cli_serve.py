@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.clients import ClientProcess
-from tests.support.command import LAMP, LAMP_TYPE, json_lines, rosasync, terminal
+from tests.support.command import DISCOVERY, LAMP, LAMP_TYPE, json_lines, rosasync, terminal
 from tests.support.introspected import NAME as WATCHED
 from tests.support.introspected import IntrospectedProcess
 from tests.support.servers import ServerProcess
@@ -49,7 +49,7 @@ def test_serve_fails_and_drops() -> None:
         dropping.wait_for("Ctrl-C ends it")
         failed = rosasync("call", "/stub/fails", "data: true", "--field", "success")
         assert failed.stdout == "false\n"
-        assert rosasync("call", "/stub/drops", "--timeout", "3").returncode == 4
+        assert rosasync("call", "/stub/drops", "--timeout", DISCOVERY).returncode == 4
         dropping.interrupt()
         assert dropping.end() == 130
     assert "responses: 0" in dropping.screen
@@ -160,7 +160,7 @@ def test_bench_in_a_pipe(lamp: ServerProcess) -> None:
 
 @pytest.mark.slow
 def test_bench_counts_losses(lamp: ServerProcess) -> None:
-    options = ("--duration", "0.1", "--timeout", "3", "--callers", "1", "--json")
+    options = ("--duration", "0.1", "--timeout", DISCOVERY, "--callers", "1", "--json")
     done = rosasync("bench", "/lamp/silent", LAMP_TYPE, *options)
     assert done.returncode == 4
     (figures,) = json_lines(done.stdout)

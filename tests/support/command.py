@@ -16,10 +16,24 @@ import pyte
 
 from tests.support.process import ROOT, own
 
-__all__ = ["LAMP", "LAMP_TYPE", "LIMIT", "Terminal", "json_lines", "rosasync", "terminal"]
+__all__ = [
+    "DISCOVERY",
+    "LAMP",
+    "LAMP_TYPE",
+    "LIMIT",
+    "Terminal",
+    "json_lines",
+    "rosasync",
+    "terminal",
+]
 
 LAMP, LAMP_TYPE = "/lamp/switch", "std_srvs/srv/SetBool"
 LIMIT = 120.0
+DISCOVERY = "10"
+"""Seconds for ``--timeout`` or ``--wait``, in which a command surely discovers every server.
+
+A process announces itself every 3 s, and a busy machine may lose that or let it wait.
+"""
 COLUMNS, LINES = 100, 30
 
 
