@@ -107,7 +107,8 @@ class Child:
     def ask_now(self, command: str, *, patience: float = 4 * LIMIT, **arguments: Any) -> Any:
         """Send a command and block until the child has answered it.
 
-        A child that does not answer is ended, and its threads' stacks go to its stderr.
+        A child that does not answer is ended, and its threads' stacks go to its stderr, or to the
+        error's notes if it is quiet.
 
         Args:
             command: the name of the command. ``ready`` does nothing.
@@ -126,8 +127,11 @@ class Child:
                 raise self._ended() from None
             ready, _, _ = select.select([self._answers], [], [], patience)
             if not ready:
-                self.kill(stacks=True)
-                raise Unanswered(f"{self.module} did not answer {command!r} in {patience:g} s")
+                self._write_stacks()
+                late = Unanswered(f"{self.module} did not answer {command!r} in {patience:g} s")
+                late.add_note("\n".join(self._logged()))
+                self._reap()
+                raise late
             line = self._answers.readline()
         if not line:
             raise self._ended()
@@ -149,9 +153,7 @@ class Child:
             stacks: write its threads' stacks to its stderr before.
         """
         if stacks:
-            self.signal(signal.SIGABRT)
-            with suppress(subprocess.TimeoutExpired):
-                self._process.wait(LIMIT / 4)
+            self._write_stacks()
         self._reap()
 
     def interrupt(self) -> None:
@@ -173,6 +175,18 @@ class Child:
         """Called by `close` if the child does not end."""
         self.kill(stacks=True)
 
+    def _write_stacks(self) -> None:
+        self.signal(signal.SIGABRT)
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(LIMIT / 4)
+
+    def _logged(self) -> list[str]:
+        """Return the lines that it has written, if it is quiet."""
+        if self._log is None:
+            return []
+        self._log.seek(0)
+        return self._log.read().decode(errors="replace").strip().splitlines()
+
     def _reap(self) -> None:
         with suppress(ProcessLookupError):
             os.killpg(self.pid, signal.SIGKILL)
@@ -187,10 +201,7 @@ class Child:
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(LIMIT)
         code = self._process.poll()
-        last = []
-        if self._log is not None:
-            self._log.seek(0)
-            last = self._log.read().decode(errors="replace").strip().splitlines()[-3:]
+        last = self._logged()[-3:]
         self.kill()
         return ChildError(" / ".join((f"{self.module} ended with code {code}", *last)))
 
