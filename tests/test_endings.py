@@ -18,12 +18,15 @@ from rosasync import (
     Limits,
     QueueTimeout,
     ResponseTimeout,
+    Retry,
     RosasyncError,
     ServerGone,
     ServiceUnavailable,
     Session,
     SessionClosed,
 )
+from rosasync._client import response_times
+from rosasync._client.graph_watch import POLL_CONTEXT
 from tests.support.checks import assert_clean, check_call, pending_in_rclpy
 from tests.support.echo import ECHO, answer_to, request_of
 from tests.support.servers import ServerProcess
@@ -35,8 +38,9 @@ if TYPE_CHECKING:
 
 
 @pytest.fixture
-async def narrow(bridge: Bridge) -> AsyncIterator[Session]:
-    """A session with one place for each service, and a long grace period."""
+async def narrow(bridge: Bridge, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Session]:
+    """A session with one place for each service, which no request gives back by being slow."""
+    monkeypatch.setattr(response_times, "PATIENCE_INITIAL", LIMIT)
     limits = Limits(clients=1, in_flight=1, grace=LIMIT)
     async with Session("narrow", bridge=bridge, limits=limits, timeout=LIMIT) as session:
         yield session
@@ -206,7 +210,7 @@ class TestAfterSending:
         )
         following = call(narrow, "/echo", "following")
         await waiting(narrow, 1)
-        assert await server.received("/echo") == ["given up"]
+        assert await server.received("/echo", 1) == ["given up"]
         await server.release("/echo")
         assert await server.received("/echo", 2) == ["given up", "following"]
         statistics = narrow.pool.statistics()
@@ -217,16 +221,22 @@ class TestAfterSending:
 
     @pytest.mark.parametrize("way", ["cancelled", "timed out"])
     async def test_or_after_the_grace_period(
-        self, bridge: Bridge, server: ServerProcess, way: str
+        self,
+        bridge: Bridge,
+        server: ServerProcess,
+        way: str,
+        monkeypatch: pytest.MonkeyPatch,
     ) -> None:
+        monkeypatch.setattr(response_times, "PATIENCE_INITIAL", LIMIT)
         await server.serve("/echo", delay="hold")
         limits = Limits(in_flight=1, grace=20 * TICK)
         async with Session("graceful", bridge=bridge, limits=limits, timeout=LIMIT) as session:
             await session.wait_for_service(ECHO, "/echo")
             await give_up(session, server, way)
+            # In the turn in which the caller learns of its end: the grace period has just begun.
             following = call(session, "/echo", "following")
-            await until(lambda: session.pool.statistics().waiting == 1)
-            assert session.pool.statistics().abandoned == 1
+            statistics = session.pool.statistics()
+            assert (statistics.abandoned, statistics.waiting) == (1, 1)
             await server.received("/echo", 2)
             assert session.pool.statistics().abandoned == 0
             await server.release("/echo", newest=True)
@@ -303,8 +313,8 @@ class TestAfterSending:
 async def give_up(session: Session, server: ServerProcess, way: str) -> None:
     """Make a call, and cancel it or let it time out after it was sent."""
     task = call(session, "/echo", "given up", timeout=LIMIT if way == "cancelled" else 6 * TICK)
-    await server.received("/echo", 1)
     if way == "cancelled":
+        await server.received("/echo", 1)
         task.cancel()
     with pytest.raises(asyncio.CancelledError if way == "cancelled" else ResponseTimeout):
         await task
@@ -337,9 +347,9 @@ async def wait_in_every_way(session: Session, server: ServerProcess) -> Ways:
     return ways
 
 
-async def assert_all_raise(ways: Ways, error: type[RosasyncError], limit: float) -> None:
+async def assert_all_raise(ways: Ways, error: type[RosasyncError]) -> None:
     """Assert that every task ends with this error, and none with a cancellation."""
-    await asyncio.wait(ways.values(), timeout=limit)
+    await asyncio.wait(ways.values(), timeout=LIMIT)
     endings = {
         name: "cancelled" if task.cancelled() else task.exception() if task.done() else "pending"
         for name, task in ways.items()
@@ -355,7 +365,7 @@ class TestSessionClosed:
     ) -> None:
         ways = await wait_in_every_way(narrow, server)
         await narrow.aclose()
-        await assert_all_raise(ways, SessionClosed, LIMIT)
+        await assert_all_raise(ways, SessionClosed)
 
     async def test_by_the_block_that_opened_it(self, bridge: Bridge, server: ServerProcess) -> None:
         await server.serve("/echo", delay="hold")
@@ -375,7 +385,7 @@ class TestSessionClosed:
 
     async def test_at_each_await_of_its_callers(self, bridge: Bridge, echo: str) -> None:
         for turns in range(8):
-            session = Session("brief", bridge=bridge)
+            session = Session("brief", bridge=bridge, timeout=2 * LIMIT)
             await session.__aenter__()
             warm = session.start(ECHO, echo, request_of("warm"))
             if turns % 2:
@@ -394,14 +404,17 @@ async def shut_down(context: Any) -> None:
 
 
 class TestContextShutDown:
-    """Callers get ContextShutdown within a second."""
+    """Callers get ContextShutdown within a second, if the machine is not busy."""
+
+    def test_the_context_is_polled_often_enough(self) -> None:
+        assert POLL_CONTEXT < 1.0
 
     async def test_while_callers_wait_in_every_way(
         self, narrow: Session, server: ServerProcess
     ) -> None:
         ways = await wait_in_every_way(narrow, server)
         await shut_down(narrow.node.context)
-        await assert_all_raise(ways, ContextShutdown, 1.0)
+        await assert_all_raise(ways, ContextShutdown)
         with pytest.raises(ContextShutdown):
             await narrow.call(ECHO, "/echo")
         await narrow.aclose()
@@ -417,7 +430,7 @@ class TestContextShutDown:
             ) as session:
                 ways = await wait_in_every_way(session, server)
                 await asyncio.to_thread(rclpy.shutdown)
-                await assert_all_raise(ways, ContextShutdown, 1.0)
+                await assert_all_raise(ways, ContextShutdown)
         finally:
             rclpy.try_shutdown()
             node.destroy_node()
@@ -486,7 +499,8 @@ class TestLastServerGone:
     async def test_killed_with_calls_out_and_another_in_its_place(
         self, session: Session, server: ServerProcess
     ) -> None:
-        async with ServerProcess(lease=1) as mortal:
+        # Longer than a busy machine may hold it up.
+        async with ServerProcess(lease=4) as mortal:
             await mortal.serve("/echo", delay="hold")
             calls = [call(session, "/echo", str(n), timeout=None) for n in range(10)]
             await mortal.received("/echo", 10)
@@ -511,6 +525,8 @@ class TestLastServerGone:
             await asyncio.to_thread(mortal.kill)
         await server.serve("/echo")
         await until(lambda: session.node.count_services("/echo") == 2)
+        # What is sent before the middleware has matched the client with it reaches no server.
+        await check_call(session, "/echo", "matched", timeout=LIMIT, retry=Retry(after=LIMIT / 4))
         for number in range(20):
             await check_call(session, "/echo", str(number), timeout=LIMIT)
         assert session.pool.statistics().created == 1
@@ -530,7 +546,7 @@ async def test_100_calls_ended_in_each_way_leave_nothing_in_rclpy(
             task.cancel()
         await asyncio.gather(*tasks, *cancelled, return_exceptions=True)
         await until(lambda: session.pool.statistics().abandoned == 0)
-        assert pending_in_rclpy(session) == 0
+        await until(lambda: pending_in_rclpy(session) == 0)
         gone = [call(session, "/echo", "gone", timeout=None) for _ in range(10)]
         await server.received("/echo", 20)
         await server.stop("/echo")

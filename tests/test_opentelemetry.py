@@ -151,7 +151,7 @@ class TestSpans:
         await server.serve("/silent", delay="never")
         await observed.wait_for_service(ECHO, "/silent")
         with pytest.raises(ResponseTimeout) as caught:
-            await observed.call(ECHO, "/silent", timeout=4 * TICK, retry=Retry(2, after=TICK))
+            await observed.call(ECHO, "/silent", timeout=20 * TICK, retry=Retry(2, after=TICK))
         (span,) = telemetry.spans(SpanKind.CLIENT)
         assert [event.name for event in span.events] == ["sent", "sent again"]
         assert span.attributes == attributes(
@@ -254,8 +254,14 @@ class TestMetrics:
 
     @pytest.mark.parametrize("from_thread", [True, False])
     async def test_the_pool(
-        self, observed: Session, telemetry: Telemetry, server: ServerProcess, from_thread: bool
+        self,
+        observed: Session,
+        telemetry: Telemetry,
+        server: ServerProcess,
+        from_thread: bool,
+        monkeypatch: pytest.MonkeyPatch,
     ) -> None:
+        monkeypatch.setattr("rosasync.opentelemetry.POOL_TIMEOUT", LIMIT)
         await server.serve("/held", delay="hold")
         await observed.wait_for_service(ECHO, "/held")
         telemetry.trace.observe_pool(observed, "mine")

@@ -19,7 +19,7 @@ from rosasync._ros.responder import client_of
 from tests.conftest import Bridge
 from tests.support.echo import ECHO, request_of, service_class
 from tests.support.nodes import Opened, borrowed_node, open_node, reports
-from tests.support.process import ROOT
+from tests.support.process import ROOT, own
 from tests.support.serving import echo_of
 from tests.support.times import LIMIT, until
 
@@ -193,8 +193,9 @@ async def test_a_client_that_never_matches_does_not_stop_the_others(opened: Open
             await asyncio.sleep(0.005)
     assert await process.wait() == 0
     # The middleware logs its errors there too.
-    assert (await output).splitlines()[-1] == b"40"
-    assert sends["good"] == 40
+    assert own((await output).decode()).splitlines()[-1] == "40"
+    # More if the first request comes before its client is discovered completely.
+    assert sends["good"] >= 40
     assert sends["bad"] <= 1
     assert refused > 5
 

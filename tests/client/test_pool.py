@@ -28,11 +28,12 @@ from rosasync import (
     UsageError,
 )
 from rosasync._client import response_times
+from rosasync.testing import VirtualClock
 from rosasync.testing._memory.graph import MemoryNode, MemoryQueries
 from rosasync.testing._memory.services import MemoryClient
 from tests.support.fake_graph import FakeGraph
 from tests.support.plain import Echo, echo
-from tests.support.times import TICK, until
+from tests.support.times import LIMIT, TICK, until
 
 
 @asynccontextmanager
@@ -476,13 +477,16 @@ class TestRetry:
 
     async def test_the_attempts_end_and_the_deadline_holds(self, fake_graph: FakeGraph) -> None:
         fake_graph.serve(Echo, "/echo", echo)
-        async with opened(fake_graph, Limits(grace=TICK)) as session:
+        clock = VirtualClock()
+        async with opened(fake_graph, Limits(grace=LIMIT)) as session:
             await ask(session, 0)
+            retry = Retry(3, LIMIT, 1.0)
             with fake_graph.drop_requests(), pytest.raises(ResponseTimeout):
-                await ask(session, 1, retry=Retry(3, TICK, 1.0), timeout=6 * TICK)
+                await clock.skip(ask(session, 1, retry=retry, timeout=6 * LIMIT))
             total = session.pool.statistics()
             assert (total.retried, total.abandoned) == (2, 3)
-            await until(lambda: session.pool.statistics().abandoned == 0)
+            await clock.advance(LIMIT)
+            assert session.pool.statistics().abandoned == 0
 
 
 class TestEndings:
@@ -684,7 +688,7 @@ class TestClients:
 
     async def test_wait_and_retry(self, fake_graph: FakeGraph) -> None:
         async with fake_graph.session() as session:
-            impatient = session.client(Echo, "/echo", wait=False, retry=Retry(after=TICK))
+            impatient = session.client(Echo, "/echo", wait=False, retry=Retry(after=10 * TICK))
             with pytest.raises(ServiceUnavailable):
                 await impatient.call()
             with pytest.raises(ServiceUnavailable):

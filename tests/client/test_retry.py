@@ -21,6 +21,7 @@ from rosasync._client import response_times, retry
 from rosasync._client.counts import Counts
 from rosasync._client.matching import GONE_DELAY
 from rosasync._client.retry import Action, Plan, RetryBudget
+from rosasync.testing import VirtualClock
 from rosasync.testing._memory.graph import MemoryNode
 from tests.support.echo import ECHO, answer_to, request_of
 from tests.support.plain import Echo, echo
@@ -266,7 +267,7 @@ class TestBudget:
             with fake_graph.drop_requests():
                 with pytest.raises(ResponseTimeout, match=r"Retry\.budget is used up"):
                     await asyncio.gather(
-                        *(ask(session, n, retry=hasty, timeout=2 * TICK) for n in range(3))
+                        *(ask(session, n, retry=hasty, timeout=10 * TICK) for n in range(3))
                     )
                 with pytest.raises(ResponseTimeout) as caught:
                     await ask(session, 1, timeout=TICK / 5)
@@ -416,13 +417,15 @@ class TestPlan:
 
 async def test_a_call_follows_its_plan(fake_graph: FakeGraph) -> None:
     fake_graph.serve(Echo, "/echo", echo)
+    clock = VirtualClock()
     async with fake_graph.session() as session:
         await ask(session, 0)
         with fake_graph.drop_requests():
             for attempts in (1, 2, 4):
                 before = sent(fake_graph)
+                again = Retry(attempts, 0.0, 1.0, math.inf)
                 with pytest.raises(ResponseTimeout):
-                    await ask(session, 1, retry=Retry(attempts, 0.0, 1.0, math.inf), timeout=TICK)
+                    await clock.skip(ask(session, 1, retry=again, timeout=LIMIT))
                 assert sent(fake_graph) - before == attempts
 
 
@@ -433,7 +436,7 @@ async def test_a_retransmission_is_the_last_attempt_although_the_delay_of_the_fi
     async with fake_graph.session(limits=Limits(in_flight=100)) as session:
         await ask(session, 0)
         with fake_graph.drop_requests():
-            lost = start(session, "lost", retry=Retry(2, TICK), timeout=4 * TICK)
+            lost = start(session, "lost", retry=Retry(2, LIMIT), timeout=4 * LIMIT)
             before = sent(fake_graph)
             port = next(iter(fake_graph.nodes[0].clients))
             for _ in range(3):
@@ -443,7 +446,7 @@ async def test_a_retransmission_is_the_last_attempt_although_the_delay_of_the_fi
             await asyncio.sleep(0)
             assert session.pool.statistics().fast_retries == 1
             with pytest.raises(ResponseTimeout, match="sent 2 times"):
-                await lost
+                await VirtualClock().skip(lost)
             assert sent(fake_graph) - before == 3 + 1
 
 
