@@ -21,6 +21,7 @@ from rosasync import (
     SessionClosed,
     UsageError,
 )
+from rosasync._client import matching
 from rosasync._core.ports import PortDestroyed
 from rosasync._ros.profile import HEARTBEAT, STOCK_HEARTBEAT, SWITCH
 from tests.support.checks import count_threads
@@ -59,14 +60,18 @@ class TestClose:
         assert server.statistics().responded == 5
         assert session.statistics().servers == ()
 
-    async def test_all_answers_arrive_that_were_sent_before_the_end(self, session: Session) -> None:
+    async def test_all_answers_arrive_that_were_sent_before_the_end(
+        self, session: Session, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         """The last ones were lost if the executor's thread was too busy to take them at once."""
+        # Far longer than each of them takes, also on a busy machine, and far shorter than all five.
+        monkeypatch.setattr(matching, "GONE_DELAY", 10 * TICK)
         gate = Gate()
 
         server = session.serve(ECHO, "/served", gate, concurrency=5)
         tasks = [ask(session, "/served", str(n)) for n in range(5)]
         await until(lambda: server.statistics().taken == 5)
-        session.node.create_timer(TICK / 50, lambda: time.sleep(TICK / 2))
+        session.node.create_timer(TICK / 50, lambda: time.sleep(4 * TICK))
         gate.set()
         await server.aclose()
         assert await asyncio.gather(*tasks) == [str(n) for n in range(5)]
@@ -117,12 +122,12 @@ class TestClose:
 
         async def handler(call: AnyCall) -> None:
             call.respond(echo_of(call.request))
-            await call.server.aclose()
+            await call.server.aclose(None)
             closed.set()
 
         session.serve(ECHO, "/served", handler)
         assert await ask(session, "/served", "text") == "text"
-        await asyncio.wait_for(closed.wait(), 10 * TICK)
+        await asyncio.wait_for(closed.wait(), LIMIT)
 
     async def test_a_handler_that_ignores_its_cancellation(
         self, session: Session, caplog: pytest.LogCaptureFixture, monkeypatch: Any
@@ -371,8 +376,9 @@ class TestLastResponses:
             server._port.delivered()
 
     async def test_a_session_that_answers_and_ends(
-        self, bridge: Bridge, client_process: ClientProcess
+        self, bridge: Bridge, client_process: ClientProcess, monkeypatch: pytest.MonkeyPatch
     ) -> None:
+        monkeypatch.setattr("rosasync._server.sending.DELIVERY_TIME", LIMIT)
         for _ in range(3):
             async with Session("answering", bridge=bridge) as session:
                 holder = Holder()

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 from rosasync import Retry, Session, SessionClosed
+from rosasync._ros.inspect import all_discovered
 from tests.support.checks import count_descriptors, count_threads
 from tests.support.clients import ClientProcess, Tally
 from tests.support.echo import ECHO
@@ -48,13 +49,15 @@ def name() -> str:
     return f"/stressed_{next(numbers)}"
 
 
-async def burst(
-    crowd: list[ClientProcess], name: str, timeout: float = LIMIT, **options: Any
-) -> dict[str, int]:
+async def start_burst(crowd: list[ClientProcess], name: str, **options: Any) -> None:
     """Have 50 clients in four processes make ten calls each, all at once."""
     shares = [len(range(number, CLIENTS, PROCESSES)) for number in range(PROCESSES)]
     for process, clients in zip(crowd, shares, strict=True):
-        await process.start(name, EACH, clients=clients, in_flight=EACH, timeout=timeout, **options)
+        await process.start(name, EACH, clients=clients, in_flight=EACH, **options)
+
+
+async def results(crowd: list[ClientProcess]) -> dict[str, int]:
+    """Wait for the ends of all calls of a burst, and count them."""
     tallies = await asyncio.gather(*(process.result() for process in crowd))
     return {
         "answered": sum(tally.answered for tally in tallies),
@@ -79,7 +82,8 @@ async def test_a_burst_of_500_requests_is_answered(
     session: Session, crowd: list[ClientProcess], name: str, form: str
 ) -> None:
     async with serving(session, name, form) as server:
-        result = await burst(crowd, name, depth=1000)
+        await start_burst(crowd, name, depth=1000)
+        result = await results(crowd)
         assert result == {"answered": CLIENTS * EACH, "wrong": 0, "lost": 0}
         await settled(server)
         assert server.statistics().taken == server.statistics().responded == CLIENTS * EACH
@@ -90,7 +94,11 @@ async def test_a_burst_of_stock_clients_is_taken_and_answered(
 ) -> None:
     """The clients' queues of ten may lose responses. Those do not count against the server."""
     async with serving(session, name, "async, request and response") as server:
-        result = await burst(crowd, name, timeout=LIMIT / 4)
+        await start_burst(crowd, name)
+        await until(lambda: server.statistics().responded == CLIENTS * EACH)
+        for process in crowd:
+            await process.give_up()
+        result = await results(crowd)
         assert result["wrong"] == 0
         assert result["answered"] + result["lost"] == CLIENTS * EACH
         await settled(server)
@@ -187,6 +195,8 @@ async def test_the_server_closes_while_four_threads_answer(
     statistics = server.statistics()
     assert statistics.taken == statistics.responded + statistics.dropped
     assert answerers.refused == statistics.dropped
+    for process in crowd:
+        await process.give_up()
     tallies = await asyncio.gather(*(process.result() for process in crowd))
     assert sum(tally.wrong for tally in tallies) == 0
     # The middleware drops the responses that a destroyed writer has not delivered: at most as many
@@ -220,6 +230,8 @@ async def test_closed_and_opened_again(
             # One request at a time. More of them, repeated every 50 ms, are more than a server can
             # answer on a loaded machine: it drops what exceeds its backlog, the session's too.
             await join(process, "/reopened", seen, timeout=TICK)
+    # Each process that is discovered takes descriptors.
+    await until(lambda: all_discovered(session.node))
     before = count_threads(), count_descriptors()
     for number in range(times):
         await cycle(foreign=number % 20 == 0)

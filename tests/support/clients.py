@@ -62,7 +62,7 @@ class ClientProcess(NodeProcess):
         clients: int = 1,
         depth: int | None = None,
         block: float = 0.0,
-        timeout: float = LIMIT / 4,
+        timeout: float = LIMIT,
         tag: str = "",
     ) -> None:
         """Begin a run, which goes on in the child while the test does something else.
@@ -91,6 +91,10 @@ class ClientProcess(NodeProcess):
             tag=tag or str(self.pid),
         )
 
+    async def give_up(self) -> None:
+        """End a run of ``call_async`` now: what is out counts as lost."""
+        await self.ask("give_up")
+
     async def result(self) -> Tally:
         """End the run if it has no end of its own, and wait for the result."""
         return Tally(**await self.ask("result"))
@@ -118,6 +122,7 @@ class _Run:
     timeout: float
     tag: str
     enough: threading.Event = field(default_factory=threading.Event)
+    given_up: threading.Event = field(default_factory=threading.Event)
     results: queue.SimpleQueue[Tally | Exception] = field(default_factory=queue.SimpleQueue)
 
 
@@ -134,6 +139,10 @@ class _Runner:
         self._end_last()
         self._last = _Run(**options)
         self._runs.put(self._last)
+
+    def give_up(self) -> None:
+        assert self._last is not None
+        self._last.given_up.set()
 
     def result(self) -> dict[str, int]:
         assert self._last is not None
@@ -181,7 +190,8 @@ class _Runner:
 
         def next_text() -> str | None:
             nonlocal count
-            if run.enough.is_set() if run.calls is None else count == run.calls:
+            over = run.enough.is_set() if run.calls is None else count == run.calls
+            if over or run.given_up.is_set():
                 return None
             count += 1
             return f"{run.tag}-{index}-{count}"
@@ -209,7 +219,7 @@ class _Runner:
                 working = working or bool(pending)
             _spin(executor, run.block)
             for client, pending in zip(clients, out, strict=True):
-                _settle(client, pending, tally)
+                _settle(client, pending, tally, given_up=run.given_up.is_set())
         executor.remove_node(self._node)
         executor.shutdown()
         return tally
@@ -264,13 +274,15 @@ def _spin(executor: Any, block: float) -> None:
         executor.spin_once(left)
 
 
-def _settle(client: Any, pending: dict[Any, tuple[str, float]], tally: Tally) -> None:
+def _settle(
+    client: Any, pending: dict[Any, tuple[str, float]], tally: Tally, *, given_up: bool
+) -> None:
     """Count the calls that have been answered or lost, and remove them."""
     now = time.monotonic()
     for future, (text, deadline) in list(pending.items()):
         if future.done():
             tally.count(text, future.result())
-        elif now > deadline:
+        elif given_up or now > deadline:
             client.remove_pending_request(future)
             tally.count(text, None)
         else:
