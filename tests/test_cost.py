@@ -254,7 +254,9 @@ async def goals_that_run(session: Session, server: Session, count: int) -> Async
     tasks = [asyncio.create_task(session.act(Fibonacci, "/held")) for _ in range(count)]
     try:
         # On a loaded machine, some are asked for twice.
-        await until(lambda: action.statistics().running == count <= action.statistics().asking)
+        await until(
+            lambda: action.statistics().running == count <= action.statistics().asking, 6 * LIMIT
+        )
         yield
     finally:
         for task in tasks:

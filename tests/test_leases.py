@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rosasync import Limits, PoolFull, QueueTimeout, Session, SessionClosed, UsageError
+from rosasync._ros.inspect import all_discovered
 from tests.support.checks import assert_clean, check_call, count_descriptors, count_threads
 from tests.support.echo import ECHO, answer_to, request_of
 from tests.support.times import LIMIT, TICK, until
@@ -190,7 +191,7 @@ async def test_a_lease_that_comes_too_late(bridge: Bridge, server: ServerProcess
 
 
 async def test_a_lease_held_while_the_session_closes(bridge: Bridge, echo: str) -> None:
-    session = Session("held", bridge=bridge)
+    session = Session("held", bridge=bridge, timeout=LIMIT)
     await session.__aenter__()
     async with session.pool.lease(ECHO, echo) as client:
         await client.call(request_of("open"))
@@ -201,7 +202,7 @@ async def test_a_lease_held_while_the_session_closes(bridge: Bridge, echo: str) 
 
 async def test_warm(bridge: Bridge, echo: str) -> None:
     limits = Limits(clients=3, in_flight=1)
-    async with Session("warm", bridge=bridge, limits=limits) as session:
+    async with Session("warm", bridge=bridge, limits=limits, timeout=LIMIT) as session:
         await session.wait_for_service(ECHO, echo, timeout=LIMIT)
         await session.pool.warm(ECHO, echo, clients=2)
         statistics = session.pool.statistics()
@@ -212,7 +213,8 @@ async def test_warm(bridge: Bridge, echo: str) -> None:
 
 
 async def test_idle_clients_are_destroyed_and_made_again(bridge: Bridge, echo: str) -> None:
-    async with Session("idle", bridge=bridge, limits=Limits(idle=2 * TICK)) as session:
+    limits = Limits(idle=2 * TICK)
+    async with Session("idle", bridge=bridge, limits=limits, timeout=LIMIT) as session:
         for round_ in range(1, 4):
             await check_call(session, echo, str(round_))
             assert session.pool.statistics().created == round_
@@ -254,6 +256,8 @@ async def test_a_thousand_services_leave_no_thread_or_file_behind(
 
         await check_call(session, echo, "before")
         await pool_and_evict(50)
+        # Each process that is discovered takes descriptors.
+        await until(lambda: all_discovered(session.node))
         threads, descriptors = count_threads(), count_descriptors()
         await pool_and_evict(services)
         assert session.pool.statistics().created == services + 51

@@ -11,6 +11,7 @@ import pytest
 from tests.support.hosts import NoHosts
 from tests.support.lossy import LossyHosts
 from tests.support.process import ended
+from tests.support.times import LIMIT, TICK
 
 PACKETS = 400
 ECHO = """
@@ -25,7 +26,7 @@ while True:
 ASK = """
 import socket, sys
 client, back = socket.socket(type=socket.SOCK_DGRAM), 0
-client.settimeout(0.2)
+client.settimeout(float(sys.argv[3]))
 for _ in range(int(sys.argv[2])):
     client.sendto(b"x", (sys.argv[1], 7))
     try:
@@ -36,10 +37,10 @@ print(back)
 """
 
 
-def ask(hosts: LossyHosts, host: str, packets: int) -> int:
-    """Return how many packets came back from the server."""
-    address = hosts.address("server")
-    command = [*hosts.on(host), sys.executable, "-c", ASK, address, str(packets)]
+def ask(hosts: LossyHosts, host: str, packets: int, patience: float = LIMIT) -> int:
+    """Return how many packets came back from the server, each within seconds of ``patience``."""
+    arguments = (hosts.address("server"), str(packets), str(patience))
+    command = [*hosts.on(host), sys.executable, "-c", ASK, *arguments]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     return int(done.stdout)
 
@@ -56,7 +57,7 @@ def test_three_hosts() -> None:
                 assert ask(hosts, "one", PACKETS) == ask(hosts, "two", PACKETS) == PACKETS
                 assert hosts.counts()["lost"] == 0
                 hosts.set(loss=0.2)
-                assert ask(hosts, "one", 40) < 40
+                assert ask(hosts, "one", 40, 4 * TICK) < 40
                 assert hosts.counts()["lost"] > 0
     except NoHosts as exc:
         pytest.skip(str(exc))

@@ -11,7 +11,7 @@ import pytest
 from rosasync._ros.interfaces import constants, fields, installed_types, parts
 from rosasync._ros.middleware import installed_middlewares
 from tests.support.command import rosasync
-from tests.support.process import ROOT
+from tests.support.process import ROOT, own
 
 PROGRAM = """
 import asyncio, sys
@@ -36,7 +36,7 @@ def open_session_with(middleware: str) -> str:
         cwd=ROOT,
         check=True,
     )
-    return done.stdout
+    return own(done.stdout)
 
 
 def test_a_missing_middleware_is_an_import_error() -> None:

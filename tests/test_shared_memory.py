@@ -11,7 +11,7 @@ from rosasync import RosasyncError
 from rosasync._ros import shared_memory
 from rosasync._ros.profile import is_old, profile_variable
 from rosasync._ros.shared_memory import check_ports, unfinished_ports
-from tests.support.times import TICK
+from tests.support.times import LIMIT, TICK
 
 PREFIX = "fastrtps_port" if is_old() else "fastdds_port"
 DOMAIN = 3
@@ -63,7 +63,8 @@ def test_other_files(folder: Path, name: str) -> None:
     check_ports(DOMAIN)
 
 
-def test_being_created(folder: Path) -> None:
+def test_being_created(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shared_memory, "GRACE", LIMIT)
     file = leave(folder, f"{PREFIX}7000")
     finish = threading.Timer(TICK, file.write_bytes, (READY,))
     finish.start()

@@ -13,14 +13,14 @@ from tests.support.times import LIMIT, TICK
 
 
 class Log(list[tuple[str, float]]):
-    """What ran, and when by the loop's time since the log was made."""
+    """What ran, and when by the loop's time since the log was made, to ten seconds."""
 
     def __init__(self) -> None:
         self._loop = asyncio.get_running_loop()
         self._start = self._loop.time()
 
     def add(self, name: str) -> None:
-        self.append((name, round(self._loop.time() - self._start)))
+        self.append((name, round(self._loop.time() - self._start, -1)))
 
     def later(self, seconds: float, name: str) -> asyncio.TimerHandle:
         return self._loop.call_later(seconds, self.add, name)

@@ -120,7 +120,7 @@ async def test_dropped_unclosed_by_threads(trial: Trial, echo: str, full: bool) 
 
 OPEN = """
 async def main():
-    async with Session("ended", bridge=bridge) as session:
+    async with Session("ended", bridge=bridge, timeout=30.0) as session:
         await check_call(session, "/echo", "text")
         print("called", flush=True)
         await session.call("std_srvs/srv/Trigger", "/absent", timeout=None)
@@ -145,7 +145,7 @@ FORKING = """
 import multiprocessing, os
 
 async def main():
-    async with Session("parent", bridge=bridge) as session:
+    async with Session("parent", bridge=bridge, timeout=30.0) as session:
         await check_call(session, "/echo", "before")
         print("called", flush=True)
         pid = os.fork()

@@ -158,6 +158,7 @@ async def test_a_flood_of_megabytes(trial: Trial, full: bool) -> None:
             for _ in range(20):
                 await trial.call(session, "/healthy", timeout=LIMIT)
             assert server.statistics().waiting <= bound / MEGABYTE
+            await until(lambda: server.statistics().taken == requests)
             started.set()
         assert server.statistics().rejected >= requests - 1 - bound / MEGABYTE
     assert not trial.failed

@@ -20,6 +20,7 @@ import contextlib, gc, os, resource, subprocess, tempfile
 from importlib.metadata import version
 from pathlib import Path
 from rosasync import RosasyncError
+from rosasync._ros.inspect import all_discovered
 from tests.support.checks import count_descriptors
 from tests.support.echo import ECHO
 from tests.support.serving import FORMS
@@ -47,6 +48,9 @@ async def main():
     async with Session("open", bridge=bridge) as session:
         async with session.serve(ECHO, "/open", FORMS["async, call"]):
             await check_call(session, "/open", "before")
+            # Each process that is discovered takes descriptors.
+            while not all_discovered(session.node):
+                await asyncio.sleep(0.05)
             before = count_descriptors()
             for spare in (0, 1):
                 resource.setrlimit(resource.RLIMIT_NOFILE, (before - 1 + spare, hard))

@@ -29,7 +29,8 @@ async def test_killed_and_another_a_second_later(
     async with trial.session() as session:
         for round_ in range(1, 6 if full else 2):
             name = f"/killed_{round_}"
-            async with ServerProcess(lease=1) as mortal, asyncio.TaskGroup() as group:
+            # Longer than a busy machine may hold it up.
+            async with ServerProcess(lease=3) as mortal, asyncio.TaskGroup() as group:
                 await mortal.serve(name, delay="hold")
                 group.create_task(trial.calls(session, name, 30, timeout=2 * LIMIT))
                 await mortal.received(name, 10)
@@ -115,7 +116,9 @@ async def test_answering_every_second_request(
     if retry is not None:
         assert not trial.failed
     else:
-        assert trial.failed.keys() == {"ResponseTimeout"}
+        # Those that would be answered too late on a busy machine are not sent.
+        assert trial.failed["ResponseTimeout"]
+        assert trial.failed.keys() <= {"ResponseTimeout", "QueueTimeout"}
 
 
 async def test_never_answering(trial: Trial, server: ServerProcess, full: bool) -> None:
@@ -195,4 +198,9 @@ async def test_destroyed_and_made_again_at_once(
                 await server.stop("/again")
                 await server.serve("/again")
             await trial.more_answers(50)
-    assert trial.failed.keys() <= {"ServerGone", "ResponseTimeout", "QueueTimeout"}
+    assert trial.failed.keys() <= {
+        "ServerGone",
+        "ServiceUnavailable",
+        "ResponseTimeout",
+        "QueueTimeout",
+    }

@@ -25,7 +25,7 @@ from rosasync import Session
 from tests.support.checks import check_call
 
 async def opened(bridge):
-    session = Session("left_open", bridge=bridge)
+    session = Session("left_open", bridge=bridge, timeout=30.0)
     await session.__aenter__()
     await check_call(session, "/echo", "text")
     print("called", flush=True)
@@ -57,7 +57,7 @@ async def run_program(
     )
     assert process.stdout is not None
     try:
-        async with asyncio.timeout(2 * LIMIT):
+        async with asyncio.timeout(4 * LIMIT):
             # The middleware logs its errors there too.
             while (line := await process.stdout.readline()) != b"called\n":
                 assert line, "it ended before its first call"
