@@ -196,8 +196,14 @@ class _Clients:
         self._until(lambda: subscription.get_publisher_count() > 0)
 
     def statuses(self, name: str, goal: str, last: int) -> list[int]:
-        messages = self._messages[name]
-        self._until(lambda: messages and messages[-1].get(goal) == last)
+        messages: list[dict[str, int]] = []
+
+        def is_last() -> bool:
+            # Further messages may come before they are looked through.
+            messages[:] = self._messages[name]
+            return bool(messages) and messages[-1].get(goal) == last
+
+        self._until(is_last)
         seen: list[int] = []
         for message in messages:
             status = message.get(goal)

@@ -18,7 +18,7 @@ from uuid import UUID
 from tests.support.child import serve_commands
 from tests.support.executor import run_in
 from tests.support.process import NodeProcess
-from tests.support.times import LIMIT
+from tests.support.times import LIMIT, TICK
 
 __all__ = ["FIBONACCI", "ActionServerProcess", "End", "none_runs"]
 
@@ -52,6 +52,7 @@ class ActionServerProcess(NodeProcess):
         rate: float = 0.0,
         accept: bool = True,
         accept_delay: float = 0.0,
+        accept_later: bool = False,
         cancel: bool = True,
         canceled: End | Literal["canceled"] = "canceled",
         result_timeout: int = 900,
@@ -70,6 +71,7 @@ class ActionServerProcess(NodeProcess):
             rate: how many of them in a second; 0 for as many as it can.
             accept: whether it accepts goals.
             accept_delay: seconds before it answers to a goal.
+            accept_later: whether it answers to goals when `accept` is called, and not before.
             cancel: whether it agrees to cancel goals.
             canceled: how a goal ends that is cancelled.
             result_timeout: seconds for which it keeps results.
@@ -86,6 +88,7 @@ class ActionServerProcess(NodeProcess):
             "rate": rate,
             "accept": accept,
             "accept_delay": accept_delay,
+            "accept_later": accept_later,
             "cancel": cancel,
             "canceled": canceled,
             "result_timeout": result_timeout,
@@ -97,6 +100,10 @@ class ActionServerProcess(NodeProcess):
     async def stop(self, name: str) -> None:
         """Destroy the action server."""
         await self.ask("stop", name=name)
+
+    async def accept(self, name: str) -> None:
+        """Let the server answer to the goals that have come, and to further ones."""
+        await self.ask("accept", name=name)
 
     async def release(self, name: str) -> None:
         """Let every held goal of the server end, and further ones."""
@@ -111,9 +118,13 @@ class ActionServerProcess(NodeProcess):
         """Wait until a goal has come to the server, which it may not have accepted yet."""
         await self.ask("asked", name=name)
 
-    async def running(self, name: str) -> list[UUID]:
-        """Return the goals that have not ended."""
-        return [key for key, status in (await self.goals(name)).items() if status < 4]
+    async def running(self, name: str, at_least: int = 0) -> list[UUID]:
+        """Return the goals that have not ended, once ``at_least`` have been accepted.
+
+        A client may know of its acceptance a moment earlier than the server.
+        """
+        goals = await self.goals(name, at_least)
+        return [key for key, status in goals.items() if status < 4]
 
     async def forge(self, name: str, goal_id: UUID) -> None:
         """Publish bytes on the feedback topic that are not a message, for a goal.
@@ -149,6 +160,9 @@ class _Server:
         self.options = options
         self.type = action_type(options["action_type"])
         self.asked = threading.Event()
+        self.accepting = threading.Event()
+        if not options["accept_later"]:
+            self.accepting.set()
         self.released = threading.Event()
         self.goals: dict[str, Any] = {}
         self.accepted = threading.Condition()
@@ -193,6 +207,7 @@ class _Server:
 
     def _on_goal(self, goal: Any) -> Any:
         self.asked.set()
+        self.accepting.wait()
         time.sleep(self.options["accept_delay"])
         return self._accept
 
@@ -205,20 +220,23 @@ class _Server:
                 last[0] = goal.status
             return last[0]
 
+        # First, because a test may release the goals as soon as they are known.
+        if self.options["idle"]:
+            self._idle.append(goal)
         with self.accepted:
             self.goals[bytes(goal.goal_id.uuid).hex()] = status
             self.accepted.notify_all()
-        if self.options["idle"]:
-            self._idle.append(goal)
-        else:
+        if not self.options["idle"]:
             goal.execute()
 
     def _execute(self, goal: Any) -> Any:
         options = self.options
         topic = f"{options['name']}/_action/feedback"
         while self._node.count_subscribers(topic) < options["readers"]:
-            # Matched is what is discovered a moment later.
             time.sleep(0.02)
+        if options["readers"]:
+            # What is discovered is matched a moment later.
+            time.sleep(TICK)
         for number in range(options["feedback"]):
             self._publish(goal, number)
             if options["rate"]:
@@ -268,8 +286,12 @@ class _Servers:
 
     def stop(self, name: str) -> None:
         server = self._servers.pop(name)
+        server.accepting.set()
         run_in(self._executor, server.server.destroy)
         server.released.set()
+
+    def accept(self, name: str) -> None:
+        self._servers[name].accepting.set()
 
     def release(self, name: str) -> None:
         self._servers[name].released.set()
@@ -314,8 +336,9 @@ def main() -> None:
 
     def spin() -> None:
         while not finished.is_set():
-            # An action server that is destroyed by one thread may be in another's wait set.
-            with suppress(rclpy_implementation.RCLError):
+            # An action server that is destroyed by one thread may be in another's wait set, or
+            # have just accepted a goal.
+            with suppress(rclpy_implementation.RCLError, rclpy_implementation.InvalidHandle):
                 try:
                     executor.spin_once()
                 except KeyError as error:
