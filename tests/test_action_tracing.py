@@ -39,7 +39,7 @@ async def test_a_goal_is_one_call(fake_graph: FakeGraph) -> None:
         with pytest.raises(GoalAborted):
             await session.act(Fibonacci, "/fibonacci", {"order": -1})
         with pytest.raises(GoalTimeout):
-            await session.act(Fibonacci, "/fibonacci", {"order": 1}, timeout=TICK)
+            await session.act(Fibonacci, "/fibonacci", {"order": 1}, timeout=20 * TICK)
         async with session.goal(Fibonacci, "/fibonacci", {"order": 1}) as goal:
             await goal.cancel()
         async with session.goal(Fibonacci, "/fibonacci", {"order": 1}) as goal:

