@@ -698,15 +698,18 @@ class TestTrees:
         await server.serve("/deaf", skip=2)
         await session.wait_for_service(ECHO, "/deaf")
         answers: list[str] = []
-        root = Retry("retry", self.call("/deaf", answers, timeout=6 * TICK), num_failures=5)
+        root = Retry("retry", self.call("/deaf", answers, timeout=10 * TICK), num_failures=5)
         assert await run_tree(root, session, where) is Status.SUCCESS
         assert answers == ["/deaf"]
-        assert await server.received("/deaf") == 3 * ["/deaf"]
+        # More than two on a busy machine, where an answer may come too late.
+        failures = session.pool.statistics().timed_out
+        assert failures >= 2
+        assert await server.received("/deaf") == (failures + 1) * ["/deaf"]
 
     async def test_timeout(
         self, session: Session, robot: ServerProcess, where: Literal["loop", "thread"]
     ) -> None:
         await session.wait_for_service(ECHO, "/never")
-        root = Timeout("timeout", self.call("/never"), duration=3 * TICK)
+        root = Timeout("timeout", self.call("/never"), duration=10 * TICK)
         assert await run_tree(root, session, where) is Status.FAILURE
         await until(lambda: session.pool.statistics().cancelled == 1)

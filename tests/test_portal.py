@@ -110,14 +110,14 @@ class TestCall:
     async def test_the_deadline_holds(self, session: Session, held: ServerProcess) -> None:
         await session.wait_for_service(ECHO, NAME)
         with pytest.raises(ResponseTimeout, match=NAME):
-            await in_thread(session.from_thread.call, ECHO, NAME, timeout=4 * TICK)
+            await in_thread(session.from_thread.call, ECHO, NAME, timeout=20 * TICK)
         with pytest.raises(ServiceUnavailable, match="/absent"):
-            await in_thread(session.from_thread.call, ECHO, "/absent", timeout=2 * TICK)
+            await in_thread(session.from_thread.call, ECHO, "/absent", timeout=20 * TICK)
         with pytest.raises(ServiceUnavailable):
             await in_thread(session.from_thread.call, ECHO, "/absent", wait=False)
 
     async def test_the_sessions_timeout_holds_where_none_is_given(self) -> None:
-        async with FakeGraph().session(timeout=TICK) as session:
+        async with FakeGraph().session(timeout=20 * TICK) as session:
             with pytest.raises(ServiceUnavailable):
                 await in_thread(session.from_thread.call, ECHO, NAME)
 

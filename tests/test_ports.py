@@ -122,7 +122,7 @@ async def test_ready_follows_the_server(world: World) -> None:
     assert not client.ready()
     await world.serve("/port_echo")
     await until(client.ready)
-    assert world.servers() == 1
+    await until(lambda: world.servers() == 1)
     assert not world.servers("std_srvs/srv/Empty")
     await world.vanish("/port_echo")
     await until(lambda: not client.ready())
