@@ -52,10 +52,11 @@ def sent(name: str) -> AbstractContextManager[subprocess.Popen[str]]:
     return ended(subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, cwd=ROOT))
 
 
-def wait_for_acceptance(process: subprocess.Popen[str]) -> None:
+def wait_for(process: subprocess.Popen[str], text: str) -> None:
+    """Wait until the command has printed this to standard error."""
     assert process.stderr is not None
-    while "accepted" not in (line := process.stderr.readline()):
-        assert line
+    while text not in (line := process.stderr.readline()):
+        assert line, f"it ended without {text!r}"
 
 
 @pytest.fixture
@@ -68,9 +69,10 @@ async def stock() -> Any:
 @pytest.mark.usefixtures("quick")
 class TestGraph:
     def test_list(self) -> None:
-        assert QUICK in rosasync("action", "list").stdout.splitlines()
-        assert f"{QUICK} [{FIBONACCI}]" in rosasync("action", "list", "-t").stdout
-        listed = json_lines(rosasync("action", "list", "--json").stdout)
+        command = ("action", "list", "--wait", DISCOVERY)
+        assert QUICK in rosasync(*command).stdout.splitlines()
+        assert f"{QUICK} [{FIBONACCI}]" in rosasync(*command, "-t").stdout
+        listed = json_lines(rosasync(*command, "--json").stdout)
         assert {"name": QUICK, "types": [FIBONACCI]} in listed
 
     def test_type(self) -> None:
@@ -85,11 +87,12 @@ class TestGraph:
         assert f"; there are {QUICK} ({FIBONACCI}). Try: rosasync action list" in done.stderr
 
     def test_info(self) -> None:
-        done = rosasync("action", "info", QUICK)
+        done = rosasync("action", "info", QUICK, "--wait", DISCOVERY)
         assert done.returncode == 0
         assert re.match(rf"{QUICK}\nservers: 1\n  /_rosasync_\d+ \[{FIBONACCI}\]\n", done.stdout)
         assert "clients: 0" in done.stdout
-        (server,) = json_lines(rosasync("action", "info", QUICK, "--json").stdout)
+        command = ("action", "info", QUICK, "--wait", DISCOVERY, "--json")
+        (server,) = json_lines(rosasync(*command).stdout)
         assert (server["role"], server["type"]) == ("server", FIBONACCI)
         done = rosasync("action", "info", f"{QUICK}_", "--wait", DISCOVERY)
         assert done.returncode == 3
@@ -175,7 +178,7 @@ class TestCancelling:
     @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
     def test_a_signal_cancels_the_goal(self, number: signal.Signals) -> None:
         with sent(SLOW) as process:
-            wait_for_acceptance(process)
+            wait_for(process, "accepted")
             process.send_signal(number)
             output, errors = process.communicate(timeout=LIMIT)
         assert (process.returncode, output) == (128 + number, "")
@@ -192,28 +195,30 @@ class TestCancelling:
         assert "Traceback" not in sending.screen
 
     def test_a_signal_before_the_acceptance(self, action_server: ActionServerProcess) -> None:
-        action_server.serve_now("/cli/late", hold=True, idle=True, accept_delay=1.0)
+        action_server.serve_now("/cli/late", hold=True, idle=True, accept_later=True)
         with sent("/cli/late") as process:
             asyncio.run(action_server.asked("/cli/late"))
             process.send_signal(signal.SIGINT)
+            wait_for(process, "interrupted before the goal was accepted")
+            asyncio.run(action_server.accept("/cli/late"))
             output, errors = process.communicate(timeout=LIMIT)
         assert (process.returncode, output) == (130, "")
-        assert "interrupted before the goal was accepted" in errors
+        assert "Traceback" not in errors
         asyncio.run(none_runs(action_server, "/cli/late"))
 
     def test_the_server_vanishes_with_the_goal(self, action_server: ActionServerProcess) -> None:
         action_server.serve_now("/cli/mortal", hold=True)
         with sent("/cli/mortal") as process:
-            wait_for_acceptance(process)
+            wait_for(process, "accepted")
             asyncio.run(action_server.stop("/cli/mortal"))
             output, errors = process.communicate(timeout=LIMIT)
         assert (process.returncode, output) == (5, "")
         assert "every server vanished before the goal ended" in errors
 
     def test_the_deadline_cancels_the_goal(self) -> None:
-        done = rosasync("action", "send", SLOW, FIBONACCI, "--timeout", "6")
+        done = rosasync("action", "send", SLOW, FIBONACCI, "--timeout", DISCOVERY)
         assert (done.returncode, done.stdout) == (4, "")
-        assert "has not ended within 6 s" in done.stderr
+        assert f"has not ended within {DISCOVERY} s" in done.stderr
         assert "the goal has ended: CANCELED" in done.stderr
 
     async def test_by_id_and_all(self, stock: ActionClientProcess) -> None:

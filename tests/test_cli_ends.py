@@ -56,8 +56,9 @@ class TestSignals:
                 wait_for(server, "Ctrl-C ends it")
                 await session.wait_for_service(LAMP_TYPE, "/stub/ended", timeout=LIMIT)
                 server.send_signal(number)
-                # Much sooner than the 20 s after which a killed one is missed.
-                await until(lambda: not session.service_is_ready(LAMP_TYPE, "/stub/ended"), 5.0)
+                # Sooner than the 20 s after which a killed one is missed.
+                ready = session.service_is_ready
+                await until(lambda: not ready(LAMP_TYPE, "/stub/ended"), LIMIT / 2)
                 _, errors = server.communicate(timeout=LIMIT)
         assert server.returncode == 128 + number
         assert "requests: 0, responses: 0" in errors
@@ -132,7 +133,8 @@ class TestStreams:
         assert done.stderr.splitlines() == expected
 
     def test_remarks_do_not_go_to_standard_output(self) -> None:
-        with started("serve", "/stub/quiet", LAMP_TYPE):
+        with started("serve", "/stub/quiet", LAMP_TYPE) as server:
+            wait_for(server, "Ctrl-C ends it")
             done = redirected(f"call /stub/quiet {LAMP_TYPE} --count 2", "2>&-")
         assert done.returncode == 0
         assert "Ctrl-C" not in done.stdout

@@ -179,13 +179,13 @@ class TestRun:
 
     def test_started_within_another_it_takes_a_port_of_its_own(self) -> None:
         nested = (sys.executable, "-m", "rosasync", "run")
-        texts = {rosasync("run", *nested, *SHOW).stdout for _ in range(3)}
+        texts = {rosasync("run", *nested, *SHOW).stdout for _ in range(4)}
         assert all(offset_in(text) for text in texts)
         assert len(texts) > 1
 
 
 def test_profile_with_a_fresh_port() -> None:
-    texts = {rosasync("profile", "--fresh").stdout for _ in range(3)}
+    texts = {rosasync("profile", "--fresh").stdout for _ in range(4)}
     assert all(missing_heartbeats(text) == [] and offset_in(text) for text in texts)
     assert len(texts) > 1
     assert rosasync("profile", "--fresh", ROS_DOMAIN_ID="233").returncode == 1

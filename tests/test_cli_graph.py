@@ -29,7 +29,8 @@ def test_list() -> None:
 def test_list_hidden() -> None:
     with terminal("serve", "/_hidden/switch", LAMP_TYPE) as server:
         server.wait_for("Ctrl-C ends it")
-        assert "/_hidden/switch" in rosasync("list", "--hidden").stdout.splitlines()
+        done = rosasync("list", "--hidden", "--wait", DISCOVERY)
+        assert "/_hidden/switch" in done.stdout.splitlines()
         assert "/_hidden/switch" not in rosasync("list").stdout.splitlines()
         server.interrupt()
         server.end()

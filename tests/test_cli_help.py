@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 import signal
@@ -118,13 +119,26 @@ def run_until_it_serves(arguments: list[str]) -> int:
         return process.wait(LIMIT)
 
 
-def complete(line: str, **environ: str) -> list[str]:
-    words = line.split(" ")
-    done = rosasync(
-        _ROSASYNC_COMPLETE="complete_bash",
-        COMP_WORDS=line,
-        COMP_CWORD=str(len(words) - 1),
-        **environ,
+def complete(line: str) -> list[str]:
+    # A shell must not hang, so it looks for services for a second only; a busy machine needs more.
+    code = (
+        "from rosasync._cli import completion\n"
+        "from rosasync.__main__ import main\n"
+        "completion.WAIT = 60.0\n"
+        "main()\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        env={
+            **os.environ,
+            "_ROSASYNC_COMPLETE": "complete_bash",
+            "COMP_WORDS": line,
+            "COMP_CWORD": str(line.count(" ")),
+        },
+        check=False,
     )
     return done.stdout.split()
 

@@ -7,11 +7,13 @@ from pathlib import Path
 
 import pytest
 
+from rosasync import Session
 from tests.support.clients import ClientProcess
 from tests.support.command import DISCOVERY, LAMP, LAMP_TYPE, json_lines, rosasync, terminal
 from tests.support.introspected import NAME as WATCHED
 from tests.support.introspected import IntrospectedProcess
 from tests.support.servers import ServerProcess
+from tests.support.times import until
 
 ECHO = "diagnostic_msgs/srv/AddDiagnostics"
 
@@ -107,16 +109,25 @@ def test_serve_reports_what_a_handler_raises(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_serve_reports_that_it_closes() -> None:
+async def test_serve_reports_that_it_closes() -> None:
     options = ("--status", "--delay", "1000")
-    with terminal("serve", "/stub/closing", LAMP_TYPE, *options) as server:
-        server.wait_for("Ctrl-C ends it")
-        with terminal("call", "/stub/closing", LAMP_TYPE, "--timeout", "60") as call:
-            server.wait_for("data: false")
-            server.interrupt()
-            assert server.end() == 130
-            assert call.end() == 5
+    async with Session("looking") as session:
+        with terminal("serve", "/stub/closing", LAMP_TYPE, *options) as server:
+            server.wait_for("Ctrl-C ends it")
+            with terminal("call", "/stub/closing", LAMP_TYPE, "--timeout", "60") as call:
+                server.wait_for("data: false")
+                await until(lambda: listens_to_departures(session))
+                server.interrupt()
+                assert server.end() == 130
+                assert call.end() == 5
     assert "the server closed before it answered" in " ".join(call.screen.split())
+
+
+def listens_to_departures(session: Session) -> bool:
+    """Return whether a server does so: once a caller is matched with the topic of its reports."""
+    node = session.node
+    topics = [name for name, _ in node.get_topic_names_and_types() if "departures" in name]
+    return any(map(node.count_subscribers, topics))
 
 
 @pytest.mark.slow
@@ -146,12 +157,13 @@ def test_demo_serves_the_tutorials_lamp(lamp: ServerProcess) -> None:
 
 
 def test_bench_in_a_pipe(lamp: ServerProcess) -> None:
-    done = rosasync("bench", LAMP, "--duration", "0.5", "--callers", "3")
+    options = ("--duration", "0.5", "--timeout", DISCOVERY)
+    done = rosasync("bench", LAMP, *options, "--callers", "3")
     assert (done.returncode, done.stderr) == (0, "")
     assert "answered, 0 failed in" in done.stdout
     assert "from " in done.stdout
     (figures,) = json_lines(
-        rosasync("bench", LAMP, LAMP_TYPE, "--duration", "0.5", "--rate", "100", "--json").stdout
+        rosasync("bench", LAMP, LAMP_TYPE, *options, "--rate", "100", "--json").stdout
     )
     assert figures["answered"] > 0
     assert figures["failed"] == {}
@@ -170,7 +182,8 @@ def test_bench_counts_losses(lamp: ServerProcess) -> None:
 
 @pytest.mark.slow
 def test_ctrl_c_ends_a_bench_with_its_summary(lamp: ServerProcess) -> None:
-    with terminal("bench", LAMP, "--duration", "1000", "--rate", "500") as command:
+    options = ("--duration", "1000", "--rate", "500", "--timeout", DISCOVERY)
+    with terminal("bench", LAMP, *options) as command:
         command.wait_for(r"[1-9]\d* answered, 0 failed")
         command.interrupt()
         assert command.end() == 130

@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import os
 import shlex
+import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -34,6 +36,8 @@ DISCOVERY = "10"
 
 A process announces itself every 3 s, and a busy machine may lose that or let it wait.
 """
+PATIENCE = 10.0
+"""Seconds in which a command that is ended may clean up."""
 COLUMNS, LINES = 100, 30
 
 
@@ -85,8 +89,18 @@ class Terminal:
         self._process.sendintr()
 
     def kill(self) -> None:
-        """End the command if it still runs."""
-        self._process.close(force=True)
+        """End the command if it still runs.
+
+        pexpect gives it a tenth of a second for each signal, also for SIGKILL, and then raises.
+        """
+        process = self._process
+        process.kill(signal.SIGTERM)
+        end = time.monotonic() + PATIENCE
+        while process.isalive():
+            if time.monotonic() > end:
+                process.kill(signal.SIGKILL)
+            time.sleep(0.01)
+        process.close()
 
     def end(self) -> int:
         """Wait for the end, and return the exit code."""
@@ -111,7 +125,7 @@ class Terminal:
 
 @contextmanager
 def terminal(*arguments: str, into: str = "", **environ: str) -> Iterator[Terminal]:
-    """Start the command on a pseudo-terminal, and end it with the block.
+    """Start the command on a pseudo-terminal, and end it with the block, as SIGTERM does.
 
     Args:
         arguments: what follows ``rosasync``.
