@@ -42,15 +42,38 @@ def stock() -> Iterator[IntrospectedProcess]:
 
 @asynccontextmanager
 async def listening(
-    recording: Recording, session: Session, service: tuple[Any, str], publishers: int = 1
+    recording: Recording,
+    session: Session,
+    service: tuple[Any, str],
+    to: Session | IntrospectedProcess,
+    publishers: int = 1,
 ) -> AsyncIterator[None]:
-    """Listen to a service, whose events are discovered when the block begins."""
-    topic = f"{service[1]}/_service_event"
+    """Listen to a service, whose events are discovered when the block begins.
+
+    Args:
+        recording: what gets the calls.
+        session: the session that listens.
+        service: the type and the name of the service.
+        to: whose events.
+        publishers: how many publishers of events there are.
+    """
     async with recording.listen(session, service):
-        await until(lambda: session.node.count_publishers(topic) >= publishers)
-        # Publishers are discovered before they have discovered the subscription.
-        await asyncio.sleep(10 * TICK)
+        await discovered(session, to, service[1], publishers)
         yield
+
+
+async def discovered(
+    session: Session, to: Session | IntrospectedProcess, name: str, publishers: int
+) -> None:
+    """Wait until publishers of events and a subscription know each other."""
+    topic = f"{name}/_service_event"
+    await until(lambda: session.node.count_publishers(topic) >= publishers)
+    if isinstance(to, IntrospectedProcess):
+        await until(lambda: to.listeners)
+    else:
+        await until(lambda: to.node.count_subscribers(topic))
+    # Matched is what is discovered a moment later.
+    await asyncio.sleep(4 * TICK)
 
 
 class TestOfASession:
@@ -112,7 +135,7 @@ class TestOfOtherNodes:
         node = ParameterClient(session, "/watched", timeout=2 * LIMIT)
         await node.set(PARAMETER, "contents")
         recording = Recording()
-        async with listening(recording, session, (SetBool, NAME)):
+        async with listening(recording, session, (SetBool, NAME), stock):
             for data in (True, False):
                 await asyncio.to_thread(stock.call, data)
             await until(lambda: len(recording.calls) == 2 and recording.calls[1].response)
@@ -132,7 +155,7 @@ class TestOfOtherNodes:
 
             async with both.serve(SetBool, LAMP, switch):
                 await both.call(SetBool, LAMP)
-                async with listening(recording, session, (SET_BOOL, LAMP), publishers=2):
+                async with listening(recording, session, (SET_BOOL, LAMP), both, publishers=2):
                     await asyncio.gather(*(both.call(SetBool, LAMP, ON) for _ in range(5)))
                     await both.call(SetBool, LAMP, OFF)
                     await until(lambda: len(recording.calls) == 6 and recording.calls[5].response)
@@ -148,15 +171,14 @@ class TestOfOtherNodes:
             held: list[Any] = []
             async with both.serve(SetBool, LAMP, lambda call: held.append(call)):
                 await both.pool.warm(SetBool, LAMP, clients=2)
-                async with listening(recording, session, (SetBool, LAMP), publishers=3):
+                async with listening(recording, session, (SetBool, LAMP), both, publishers=3):
                     calls = [both.start(SetBool, LAMP, ON) for _ in range(2)]
                     await until(lambda: len(held) == 2)
                     for call in held:
                         call.respond(SetBool.Response(success=True))
                     await asyncio.gather(*calls)
-                    await until(
-                        lambda: [call.response for call in recording.calls].count(None) == 0
-                    )
+                    await until(lambda: len([c for c in recording.calls if c.response]) == 2)
+                    # Longer than a third one would take.
                     await asyncio.sleep(4 * TICK)
         assert [call.request for call in recording.calls] == [ON, ON]
 
@@ -166,7 +188,7 @@ class TestOfOtherNodes:
             held: list[Any] = []
             async with both.serve(SetBool, LAMP, lambda call: held.append(call)):
                 await both.wait_for_service(SetBool, LAMP)
-                async with listening(recording, session, (SetBool, LAMP)):
+                async with listening(recording, session, (SetBool, LAMP), both, publishers=2):
                     call = both.start(SetBool, LAMP, ON)
                     await until(lambda: held)
                     await until(lambda: recording.calls)
@@ -184,7 +206,7 @@ class TestOfOtherNodes:
         node = ParameterClient(session, "/watched", timeout=2 * LIMIT)
         await node.set(PARAMETER, "metadata")
         recording = Recording()
-        async with listening(recording, session, (SetBool, NAME)):
+        async with listening(recording, session, (SetBool, NAME), stock):
             for _ in range(2):
                 await asyncio.to_thread(stock.call, True)
             await until(lambda: "have no contents" in caplog.text)
@@ -215,9 +237,8 @@ class TestOfOtherNodes:
                 both.serve(srv_type, srv_name, lambda request, response: response)
                 await both.call(srv_type, srv_name)
             async with recording.listen(session, *services):
-                topics = [f"/{name}/_service_event" for _, name in services]
-                await until(lambda: min(map(session.node.count_publishers, topics)) >= 2)
-                await asyncio.sleep(10 * TICK)
+                for _, srv_name in services:
+                    await discovered(session, both, f"/{srv_name}", publishers=2)
                 for srv_type, srv_name in services:
                     await both.call(srv_type, srv_name)
                 await until(lambda: len(recording.calls) == 2)
@@ -296,11 +317,13 @@ class TestReplay:
         assert answers == ["3", "1", "2", "4", "4"]
 
     async def test_a_request_that_was_not_recorded(self, ros_graph: Graph) -> None:
-        ros_graph.replay(Recording([RecordedCall(LAMP, SET_BOOL, ON, answer(1))]))
+        recording = Recording([RecordedCall(LAMP, SET_BOOL, ON, answer(1))])
+        lamp = ros_graph.replay(recording)[LAMP]
         async with ros_graph.session(timeout=2 * LIMIT) as session:
             await session.wait_for_service(SetBool, LAMP)
             with pytest.raises(ResponseTimeout):
                 await session.call(SetBool, LAMP, OFF, timeout=4 * TICK)
+            await lamp.wait_for_calls(1)
         with pytest.raises(AssertionError, match="has no answer left for {'data': False}"):
             ros_graph.check()
         ros_graph.strict = False

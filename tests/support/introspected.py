@@ -27,6 +27,11 @@ class IntrospectedProcess(NodeProcess):
         self.ask_now("call", data=data)
 
     @property
+    def listeners(self) -> int:
+        """How many subscriptions to the events of the service its node has discovered."""
+        return int(self.ask_now("listeners"))
+
+    @property
     def setting(self) -> str:
         """The value of the parameter."""
         return str(self.ask_now("setting"))
@@ -73,7 +78,13 @@ def main() -> None:
     def call(data: bool) -> None:
         client.call(SetBool.Request(data=data))
 
-    serve_commands({"call": call, "setting": lambda: node.get_parameter(PARAMETER).value})
+    serve_commands(
+        {
+            "call": call,
+            "listeners": lambda: node.count_subscribers(f"{NAME}/_service_event"),
+            "setting": lambda: node.get_parameter(PARAMETER).value,
+        }
+    )
     executor.shutdown()
     spinner.join()
     node.destroy_node()
