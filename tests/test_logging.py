@@ -69,7 +69,7 @@ class TestCalls:
         await server.serve("/silent", delay="never")
         await logged.wait_for_service(ECHO, "/silent")
         with pytest.raises(ResponseTimeout):
-            await ask(logged, "/silent", "x", timeout=4 * TICK, retry=Retry(2, after=TICK))
+            await ask(logged, "/silent", "x", timeout=40 * TICK, retry=Retry(2, after=TICK))
         assert has(debug, r"#\d+ /silent: sent again after T")
         assert has(
             debug,
