@@ -30,7 +30,7 @@ import rosasync
 from rosasync._ros.domain import isolate
 from tests.support.process import ROOT, ended, first_line, own, profile
 from tests.support.project import python_path
-from tests.support.servers import running
+from tests.support.servers import running, wait_until_joined
 from tests.support.times import LIMIT
 
 DOCS = ROOT / "docs"
@@ -141,6 +141,7 @@ class Servers:
                 (sys.executable, str(path)), env=os.environ | environment, stderr=subprocess.DEVNULL
             )
             self._stack.enter_context(ended(process))
+            wait_until_joined(process, int(environment["ROS_DOMAIN_ID"]))
         return self._environments[program]
 
     def close(self) -> None:

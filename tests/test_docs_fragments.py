@@ -140,7 +140,7 @@ class TestNodes:
             async with rosasync.Session("tutorial") as session:
                 for namespace in namespaces:
                     name = f"{namespace}/{node}/get_parameters"
-                    await session.wait_for_service(GetParameters, name, timeout=LIMIT)
+                    await session.call(GetParameters, name, timeout=LIMIT)
                 await run(code, {**known(session), "arm": ParameterClient(session, "/arm")})
 
 

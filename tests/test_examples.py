@@ -63,7 +63,7 @@ async def started(folder: str, *arguments: str) -> AsyncIterator[asyncio.subproc
 
 async def line_with(process: asyncio.subprocess.Process, text: bytes) -> None:
     assert process.stdout is not None
-    async with asyncio.timeout(LIMIT):
+    async with asyncio.timeout(4 * LIMIT):
         while text not in (line := await process.stdout.readline()):
             assert line, f"it ended without {text!r}"
 

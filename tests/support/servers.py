@@ -22,12 +22,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
+from rosasync._ros.discovery import own_ports
 from tests.support.echo import ECHO, fill, response_to, service_class
 from tests.support.executor import run_in, spin
 from tests.support.process import NodeProcess, ended, profile
-from tests.support.times import LIMIT
+from tests.support.times import LIMIT, TICK
 
-__all__ = ["Delay", "Misbehaviour", "ServerProcess", "running"]
+__all__ = ["Delay", "Misbehaviour", "ServerProcess", "running", "wait_until_joined"]
 
 Delay = float | tuple[float, float] | Literal["hold", "never"] | None
 """When a request is answered: at once (None), after a number of seconds, after a random number of
@@ -48,7 +49,17 @@ def running(program: Path, *arguments: str) -> Iterator[None]:
     with profile() as environment:
         server = subprocess.Popen(command, env=os.environ | environment, stderr=subprocess.DEVNULL)
         with ended(server):
+            wait_until_joined(server, int(os.environ["ROS_DOMAIN_ID"]))
             yield
+
+
+def wait_until_joined(program: subprocess.Popen[Any], domain: int) -> None:
+    """Wait until a program has a participant in a ROS domain: it may take seconds to start."""
+    end = time.monotonic() + 4 * LIMIT
+    while not own_ports(domain, program.pid):
+        assert program.poll() is None, f"{program.args!r} has ended"
+        assert time.monotonic() < end, f"{program.args!r} joins no domain"
+        time.sleep(TICK)
 
 
 class ServerProcess(NodeProcess):
