@@ -364,7 +364,7 @@ def test_a_report_opens_with_its_conclusions(tmp_path: Path) -> None:
 
 
 SMALL_RUNS = {
-    "sharing": ("--contestants=direct,semaphore", "--processes=2", "--work=1", "--seconds=0.3"),
+    "sharing": ("--contestants=direct,semaphore", "--processes=2", "--work=1", "--seconds=1"),
     "faults": ("--situations=slow server", "--contestants=direct-retry"),
     "cold": ("--processes=1",),
     "crash": (
