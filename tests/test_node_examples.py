@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import asyncio
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from rcl_interfaces.srv import GetParameters
 
+from rosasync import Session
 from tests.support.process import own
 from tests.support.servers import running
+from tests.support.times import LIMIT
 
 DOCS = Path(__file__).parent.parent / "docs"
 EXAMPLES = DOCS / "examples" / "nodes"
@@ -38,12 +42,21 @@ finalized
 }
 
 
+async def started(node: str) -> None:
+    """Wait until a node has its services."""
+    async with Session("waiting") as session:
+        name = f"/{node}/get_parameters"
+        await session.wait_for_service(GetParameters, name, timeout=4 * LIMIT)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("example", PRINTS)
 def test_example(example: str) -> None:
     node, printed = PRINTS[example]
     command = (sys.executable, str(EXAMPLES / f"{example}.py"))
     with running(EXAMPLES / f"{node}.py"):
+        # The example waits ten seconds for it, and a busy machine takes longer to start it.
+        asyncio.run(started(node))
         done = subprocess.run(command, stdout=subprocess.PIPE, text=True, timeout=120, check=True)
     assert own(done.stdout) == printed
 
