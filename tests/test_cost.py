@@ -11,6 +11,7 @@ import asyncio
 import gc
 import statistics
 import sys
+import time
 import tracemalloc
 from array import array
 from collections import Counter
@@ -28,7 +29,7 @@ from rosasync import ServerGoal, Session
 from rosasync._client import graph_watch
 from tests.support.echo import ECHO, request_of
 from tests.support.serving import echo_call
-from tests.support.times import LIMIT, until
+from tests.support.times import LIMIT, TICK, until
 
 if TYPE_CHECKING:
     from tests.support.fake_graph import FakeGraph
@@ -265,11 +266,19 @@ async def goals_that_run(session: Session, server: Session, count: int) -> Async
 
 
 async def check_beside_goals(call: Call, bound: Cost) -> None:
-    """Check that a call beside goals that run enters no function for each of them."""
-    functions, c_functions = await _count_functions(call, CALLS)
+    """Check that a call beside goals that run enters no function for each of them.
+
+    On a busy machine, requests for their results may be sent again for some seconds more.
+    """
     # Sometimes a message for a goal arrives together with the response.
-    assert functions <= bound.functions + 2
-    assert c_functions <= bound.c_functions + 2
+    bounds = bound.functions + 2, bound.c_functions + 2
+    deadline = time.monotonic() + 2 * LIMIT
+    while True:
+        functions, c_functions = await _count_functions(call, CALLS)
+        if functions <= bounds[0] and c_functions <= bounds[1]:
+            return
+        assert time.monotonic() < deadline, (functions, c_functions, bounds)
+        await asyncio.sleep(TICK)
 
 
 async def test_a_call_beside_goals_that_run(fake_graph: FakeGraph) -> None:
