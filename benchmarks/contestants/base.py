@@ -321,6 +321,11 @@ def spinning(node: Any, executor: Any) -> Iterator[None]:
     try:
         yield
     finally:
+        from rosasync._ros import fastdds
+
+        # Otherwise it hung below, once in about 50 times that four processes ended together.
+        with node.handle:
+            fastdds.end_discovery(node.handle)
         rclpy.try_shutdown()
         thread.join()
         executor.shutdown()

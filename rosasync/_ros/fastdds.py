@@ -11,7 +11,7 @@ from typing import Any
 
 from rclpy.utilities import get_rmw_implementation_identifier
 
-__all__ = ["acknowledged", "is_present", "load_profiles"]
+__all__ = ["acknowledged", "end_discovery", "is_present", "load_profiles"]
 
 RESPONSE_WRITER = "_ZN{length}{rmw}23get_response_datawriterEP13rmw_service_s"
 """``rmw_fastrtps_cpp::get_response_datawriter(rmw_service_t *)`` (rmw_fastrtps_cpp/get_service.hpp)
@@ -22,6 +22,18 @@ WAITS = (
 )
 """``DataWriter::wait_for_acknowledgments(const Duration_t &)`` of Fast DDS 2.14 (Jazzy) and 3
 (Kilted). Both return a code of 32 bits in a register: an integer, or a trivial class around one."""
+
+PARTICIPANT = "_ZN{length}{rmw}22get_domain_participantEP10rmw_node_s"
+"""``rmw_fastrtps_cpp::get_domain_participant(rmw_node_t *)`` (rmw_fastrtps_cpp/get_participant.hpp)
+and its like, as above."""
+SET_LISTENER = (
+    "_ZN8eprosima7fastdds3dds17DomainParticipant12set_listenerEPNS1_25DomainParticipantListenerE"
+    "NSt6chrono8durationIlSt5ratioILl1ELl1EEEE"
+)
+"""``DomainParticipant::set_listener(DomainParticipantListener *, std::chrono::seconds)`` of both.
+The seconds are passed as an integer of 64 bits; the return code is as above."""
+LISTENER_TIMEOUT = 1
+"""Whole seconds to wait for the end of a call of the participant's listener."""
 
 FACTORY = "_ZN8eprosima7fastdds3dds24DomainParticipantFactory"
 GET_FACTORY = f"{FACTORY}12get_instanceEv"
@@ -72,6 +84,47 @@ def acknowledged(service: Any) -> bool:
     """
     acknowledgements = _load()
     return acknowledgements is not None and acknowledgements.complete(service.pointer)
+
+
+class Participants:
+    """The three functions that lead from a node to the listener of its participant."""
+
+    def __init__(self) -> None:
+        self._rmw_node = ctypes.CDLL("librcl.so").rcl_node_get_rmw_handle
+        name = get_rmw_implementation_identifier()
+        rmw = ctypes.CDLL(f"lib{name}.so")
+        self._participant = getattr(rmw, PARTICIPANT.format(length=len(name), rmw=name))
+        self._set_listener = getattr(rmw, SET_LISTENER)
+        for function in (self._rmw_node, self._participant):
+            function.argtypes = [ctypes.c_void_p]
+            function.restype = ctypes.c_void_p
+        self._set_listener.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64]
+        self._set_listener.restype = ctypes.c_uint32
+
+    def end_discovery(self, pointer: int) -> bool:
+        """Remove the listener of the participant of an ``rcl_node_t``; waits while it is called."""
+        participant = self._participant(self._rmw_node(pointer))
+        return bool(participant) and self._set_listener(participant, None, LISTENER_TIMEOUT) == 0
+
+
+def end_discovery(node: Any) -> bool:
+    """End the discovery of a node's context, so that its participant can be destroyed safely.
+
+    rmw_fastrtps removes the listener of a participant before it destroys it, and waits without a
+    limit for a call of the listener that runs just then. In the wheels this never ends: they are
+    built for a libc without ``pthread_cond_clockwait``, so the latest time of one clock is
+    converted to another and overflows. ``pthread_cond_timedwait`` refuses it at once, each time,
+    and never releases the mutex that the listener needs. With a limit nothing overflows; and once
+    the listener is gone, there is no call to wait for.
+
+    Args:
+        node: the handle of an rclpy node, in use.
+
+    Returns:
+        False if a call did not end within `LISTENER_TIMEOUT`, or this is not Fast DDS.
+    """
+    participants = _load_participants()
+    return participants is not None and participants.end_discovery(node.pointer)
 
 
 class Profiles:
@@ -129,6 +182,14 @@ def is_present() -> bool:
         return hasattr(ctypes.CDLL(f"lib{get_rmw_implementation_identifier()}.so"), GET_FACTORY)
     except OSError:
         return False
+
+
+@cache
+def _load_participants() -> Participants | None:
+    try:
+        return Participants()
+    except (OSError, AttributeError, ValueError):
+        return None
 
 
 @cache

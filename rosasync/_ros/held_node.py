@@ -89,6 +89,10 @@ class HeldNode:
         executor, self._executor = self._executor, None
         if executor is not None and self.node.executor is executor:
             self.node.executor = None
+        if self._own_context is not None:
+            # Not in a context that was given: its other nodes go on discovering.
+            with contextlib.suppress(InvalidHandle), self.node.handle:
+                fastdds.end_discovery(self.node.handle)
         if self._own:
             self.node.destroy_node()
         self._shut_context_down()
