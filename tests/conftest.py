@@ -101,6 +101,13 @@ def fake_graph() -> FakeGraph:
     return FakeGraph()
 
 
+@pytest.fixture
+async def sessions(fake_graph: FakeGraph) -> AsyncIterator[tuple[Session, Session]]:
+    """The sessions of a client and of a server, in one graph in memory."""
+    async with fake_graph.session(timeout=LIMIT) as client, fake_graph.session() as server:
+        yield client, server
+
+
 @pytest.fixture(params=["direct", "executor"])
 def bridge(request: pytest.FixtureRequest) -> Bridge:
     """Each of the two bridges."""

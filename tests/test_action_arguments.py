@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 import uuid
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import Awaitable, Callable
 from decimal import Decimal
 from functools import partial
 from typing import Any
@@ -26,7 +26,6 @@ from rosasync import (
     UsageError,
 )
 from rosasync.behaviours import SendGoal
-from tests.support.fake_graph import FakeGraph
 from tests.support.times import LIMIT, TICK, until
 
 NAME = "/fibonacci"
@@ -52,14 +51,6 @@ class Server:
 
     async def _run(self, goal: Any) -> Any:
         await asyncio.sleep(LIMIT)
-
-
-@pytest.fixture
-async def sessions() -> AsyncIterator[tuple[Session, Session]]:
-    """The sessions of a client and of a server, in one graph."""
-    graph = FakeGraph()
-    async with graph.session(timeout=LIMIT) as client, graph.session() as server:
-        yield client, server
 
 
 @pytest.fixture

@@ -27,7 +27,6 @@ from rosasync import (
 )
 from rosasync.behaviours import SendGoal
 from tests.support.action_servers import ActionServerProcess, none_runs
-from tests.support.fake_graph import FakeGraph
 from tests.support.times import LIMIT, TICK, until
 
 if TYPE_CHECKING:
@@ -68,14 +67,6 @@ class Server:
         if self.error is not None:
             raise self.error
         return {"sequence": [order, order]}
-
-
-@pytest.fixture
-async def sessions() -> AsyncIterator[tuple[Session, Session]]:
-    """The sessions of a client and of a server, in one graph."""
-    graph = FakeGraph()
-    async with graph.session(timeout=LIMIT) as client, graph.session() as server:
-        yield client, server
 
 
 @pytest.fixture

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable, Hashable
+from contextlib import asynccontextmanager
 from typing import Any, Literal
 
 import pytest
@@ -15,7 +16,7 @@ from test_msgs.msg import BasicTypes, Builtins
 from rosasync import InvalidServiceName
 from rosasync._actions.status import read_statuses, uuid_bytes
 from rosasync._core.gateway import LoopGateway
-from rosasync._core.ports import ClientPort, NodePort, PortDestroyed, TopicQos
+from rosasync._core.ports import ClientPort, NodePort, PortDestroyed, PublisherPort, TopicQos
 from rosasync._ros.node import RosNode
 from rosasync._status.wire import process_of
 from rosasync.options import Limits, SessionOptions
@@ -225,33 +226,36 @@ async def test_messages_come_on_the_loop_in_order_and_never_within_publish(world
     subscription.close()
 
 
-async def test_a_raw_subscription_gets_bytes_with_the_uuid_of_the_goal(world: World) -> None:
-    message_type = Fibonacci.Impl.FeedbackMessage
+@asynccontextmanager
+async def raw_topic(
+    world: World, message_type: Any
+) -> AsyncIterator[tuple[PublisherPort, list[Any]]]:
+    """Open both ends of a topic; yield its publisher, and a list of what its subscription gets."""
     arrived: list[Any] = []
     subscription = world.node.open_subscription(
         message_type, "/port_topic", TopicQos(), arrived.append, raw=True
     )
     publisher = world.node.open_publisher(message_type, "/port_topic", TopicQos())
     await until(lambda: publisher.subscriptions() and subscription.publishers())
-    publisher.publish(feedback(3, 4))
-    await until(lambda: arrived)
+    yield publisher, arrived
+    publisher.close()
+    subscription.close()
+
+
+async def test_a_raw_subscription_gets_bytes_with_the_uuid_of_the_goal(world: World) -> None:
+    message_type = Fibonacci.Impl.FeedbackMessage
+    async with raw_topic(world, message_type) as (publisher, arrived):
+        publisher.publish(feedback(3, 4))
+        await until(lambda: arrived)
     assert uuid_bytes(arrived[0]) == bytes([2] * 16)
     message = world.node.deserialize(message_type, arrived[0])
     assert sequences([message]) == [(3, 4)]
     with pytest.raises(ValueError, match="cannot be read|not a message"):
         world.node.deserialize(message_type, b"\0\1")
-    publisher.close()
-    subscription.close()
 
 
 async def test_feedback_is_read_without_the_uuid_before_it(world: World) -> None:
     message_type = NestedMessage.Impl.FeedbackMessage
-    arrived: list[Any] = []
-    subscription = world.node.open_subscription(
-        message_type, "/port_topic", TopicQos(), arrived.append, raw=True
-    )
-    publisher = world.node.open_publisher(message_type, "/port_topic", TopicQos())
-    await until(lambda: publisher.subscriptions() and subscription.publishers())
     message = message_type()
     message.goal_id.uuid = [7] * 16
     # Fields of eight bytes behind some of one, so that their alignment counts.
@@ -260,14 +264,13 @@ async def test_feedback_is_read_without_the_uuid_before_it(world: World) -> None
         nested_field=BasicTypes(bool_value=True, float64_value=2.5, int64_value=-3),
         nested_different_pkg=Time(sec=5, nanosec=6),
     )
-    publisher.publish(message)
-    await until(lambda: arrived)
+    async with raw_topic(world, message_type) as (publisher, arrived):
+        publisher.publish(message)
+        await until(lambda: arrived)
     assert world.node.deserialize_feedback(NestedMessage, arrived[0]) == message.feedback
     for unreadable in (b"", bytes(20), arrived[0][:24]):
         with pytest.raises(ValueError, match="cannot be read|not a message"):
             world.node.deserialize_feedback(NestedMessage, unreadable)
-    publisher.close()
-    subscription.close()
 
 
 async def test_a_latched_topic_has_its_newest_messages_for_those_who_come_later(
@@ -322,18 +325,13 @@ async def test_an_action_is_described_by_its_services_and_topics(world: World) -
 async def test_statuses_are_read_without_deserializing_them(world: World) -> None:
     if world.node.bridge == "memory":
         return  # It serializes nothing.
-    arrived: list[bytes] = []
-    subscription = world.node.open_subscription(
-        GoalStatusArray, "/port_status", TopicQos(), arrived.append, raw=True
-    )
-    publisher = world.node.open_publisher(GoalStatusArray, "/port_status", TopicQos())
-    await until(lambda: publisher.subscriptions() and subscription.publishers())
-    for count in (0, 1, 2, 5):
-        message = GoalStatusArray(status_list=[GoalStatus(status=i + 1) for i in range(count)])
-        for i, status in enumerate(message.status_list):
-            status.goal_info.goal_id.uuid = [i] * 16
-        publisher.publish(message)
-    await until(lambda: len(arrived) == 4)
+    async with raw_topic(world, GoalStatusArray) as (publisher, arrived):
+        for count in (0, 1, 2, 5):
+            message = GoalStatusArray(status_list=[GoalStatus(status=i + 1) for i in range(count)])
+            for i, status in enumerate(message.status_list):
+                status.goal_info.goal_id.uuid = [i] * 16
+            publisher.publish(message)
+        await until(lambda: len(arrived) == 4)
     for count, serialized in zip((0, 1, 2, 5), arrived, strict=True):
         statuses = read_statuses(serialized)
         assert statuses is not None
@@ -343,8 +341,6 @@ async def test_statuses_are_read_without_deserializing_them(world: World) -> Non
         assert len(list(padded)) == count
         assert read_statuses(serialized[:-1]) is None or count == 0
         assert read_statuses(serialized + b"\0" * 7) is None or count == 0
-    publisher.close()
-    subscription.close()
 
 
 async def test_a_server_knows_its_clients_by_their_identities(world: World) -> None:
