@@ -166,8 +166,11 @@ class TestEnding:
     """Clients that have not asked for their result when the server is closed."""
 
     async def test_one_that_was_told_of_its_acceptance_late(
-        self, fake_graph: FakeGraph, virtual_clock: VirtualClock
+        self, fake_graph: FakeGraph, virtual_clock: VirtualClock, monkeypatch: pytest.MonkeyPatch
     ) -> None:
+        # Shorter than the delay of the acceptance, and longer than that of the request for the
+        # result, by seconds: the clock goes on by itself.
+        monkeypatch.setattr(server_goals, "ASKING_TIME", 7.0)
         async with fake_graph.session() as session, fake_graph.session() as client:
             server = session.serve_action(Fibonacci, "/fib", forever)
             clients = UnmatchedClients(service_of(session, "send_goal"))
