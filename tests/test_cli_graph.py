@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from rosasync._ros.middleware import installed_middlewares
-from tests.support.command import DISCOVERY, LAMP, LAMP_TYPE, json_lines, rosasync, terminal
+from tests.support.command import DISCOVERY, LAMP, LAMP_TYPE, LOOK, json_lines, rosasync, terminal
 
 PROFILE, OTHER_PROFILE = "FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"
 if not version("rclpy").startswith("7."):
@@ -21,7 +21,7 @@ def test_list() -> None:
     lines = rosasync("list", "-t").stdout.splitlines()
     assert f"{LAMP} [{LAMP_TYPE}]" in lines
     assert not [line for line in lines if "/_" in line]
-    names = [item["name"] for item in json_lines(rosasync("list", "--json").stdout)]
+    names = [item["name"] for item in json_lines(rosasync("list", "--json", *LOOK).stdout)]
     assert LAMP in names
     assert "/lamp_server/get_parameters" in names
 
@@ -38,7 +38,7 @@ def test_list_hidden() -> None:
 
 def test_type_and_find() -> None:
     assert rosasync("type", LAMP).stdout == f"{LAMP_TYPE}\n"
-    assert LAMP in rosasync("find", LAMP_TYPE).stdout.splitlines()
+    assert LAMP in rosasync("find", LAMP_TYPE, *LOOK).stdout.splitlines()
     none = rosasync("find", "nav_msgs/srv/GetMap", "--json")
     assert (none.returncode, none.stdout) == (3, "")
     assert "no service of the type nav_msgs/srv/GetMap" in none.stderr
@@ -54,12 +54,12 @@ def test_type_and_find() -> None:
 
 
 def test_info_shows_nodes_and_clashes() -> None:
-    done = rosasync("info", "/lamp/twice")
+    done = rosasync("info", "/lamp/twice", *LOOK)
     assert done.returncode == 0
     assert "servers: 2" in done.stdout
     assert f"  /lamp_server [{LAMP_TYPE}] reliable" in done.stdout
     assert "clash: 2 servers" in done.stdout
-    (server,) = json_lines(rosasync("info", LAMP, "--json").stdout)
+    (server,) = json_lines(rosasync("info", LAMP, "--json", *LOOK).stdout)
     assert server["role"] == "server"
     assert server["node"] == "/lamp_server"
     assert rosasync("info", "/lamp/none").returncode == 3
@@ -67,8 +67,9 @@ def test_info_shows_nodes_and_clashes() -> None:
 
 def test_nodes() -> None:
     # Another process of the tests may have a node of the same name.
-    assert "/lamp_server" in [line.split()[0] for line in rosasync("nodes").stdout.splitlines()]
-    found = json_lines(rosasync("nodes", "--json").stdout)
+    lines = rosasync("nodes", *LOOK).stdout.splitlines()
+    assert "/lamp_server" in [line.split()[0] for line in lines]
+    found = json_lines(rosasync("nodes", "--json", *LOOK).stdout)
     assert "/lamp_server" in [node["name"] for node in found]
 
 
@@ -128,7 +129,7 @@ def test_ping_shows_times_on_a_terminal() -> None:
     ],
 )
 def test_why(arguments: tuple[str, ...], code: int, failed: list[str], todo: str) -> None:
-    done = rosasync("why", *arguments, "--json")
+    done = rosasync("why", *arguments, "--json", *LOOK)
     checks = json_lines(done.stdout)
     assert [check["check"] for check in checks if check["ok"] is False] == failed
     assert todo in " ".join(check["todo"] for check in checks)
@@ -172,10 +173,10 @@ def test_doctor_checks_the_profile_of_the_middleware(tmp_path: Path) -> None:
 
 
 def test_colour_on_a_terminal_only_and_not_with_no_color() -> None:
-    with terminal("why", "/lamp/swich") as command:
+    with terminal("why", "/lamp/swich", *LOOK) as command:
         assert command.end() == 3
     assert b"\x1b[" in command.raw
-    with terminal("why", "/lamp/swich", NO_COLOR="1") as command:
+    with terminal("why", "/lamp/swich", *LOOK, NO_COLOR="1") as command:
         assert command.end() == 3
     assert b"\x1b[3" not in command.raw
     assert "Did you mean" in command.screen

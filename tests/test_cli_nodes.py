@@ -18,7 +18,7 @@ from rosasync import ServiceCall, Session
 from rosasync._cli.param_values import read_value
 from rosasync._core.safe_yaml import YamlError
 from rosasync.parameters import ParameterType
-from tests.support.command import DISCOVERY, rosasync
+from tests.support.command import DISCOVERY, LOOK, rosasync
 from tests.support.managed import NodesProcess
 from tests.support.process import ROOT, own
 from tests.support.times import LIMIT, TICK
@@ -69,8 +69,9 @@ class TestParam:
 
     async def test_list_of_all_nodes(self, nodes: NodesProcess) -> None:
         node = await nodes.add("unset")
-        assert f"{node}:\n  first\n  last\n" in await printed("param", "list")
-        found = [json.loads(x) for x in (await printed("param", "list", "--json")).splitlines()]
+        assert f"{node}:\n  first\n  last\n" in await printed("param", "list", *LOOK)
+        text = await printed("param", "list", "--json", *LOOK)
+        found = [json.loads(line) for line in text.splitlines()]
         assert "first" in {one["node"]: one["parameters"] for one in found}[node]
 
     async def test_get_and_set(self, nodes: NodesProcess) -> None:
@@ -298,7 +299,7 @@ class TestLifecycle:
     async def test_nodes(self, nodes: NodesProcess) -> None:
         node = await nodes.add("lifecycle")
         other = await nodes.add("parameters", "plain")
-        text = await printed("lifecycle", "nodes")
+        text = await printed("lifecycle", "nodes", *LOOK)
         assert f"{node}: unconfigured [1]\n" in text
         assert other not in text
 
