@@ -323,7 +323,7 @@ def spinning(node: Any, executor: Any) -> Iterator[None]:
     finally:
         from rosasync._ros import fastdds
 
-        # Otherwise it hung below, once in about 50 times that four processes ended together.
+        # Otherwise it hung below, twice in about 300 times that four processes ended together.
         with node.handle:
             fastdds.end_discovery(node.handle)
         rclpy.try_shutdown()
