@@ -236,10 +236,12 @@ class TestWithoutFastDds:
         """A middleware whose library lacks Fast DDS's functions, or is not there."""
         name = request.param
         monkeypatch.setattr(fastdds, "get_rmw_implementation_identifier", lambda: name)
-        for function in ("is_present", "_load", "_load_profiles"):
+        for function in ("is_present", "_load"):
             monkeypatch.setattr(fastdds, function, getattr(fastdds, function).__wrapped__)
 
-    def test_nothing_is_loaded_or_acknowledged(self) -> None:
+    def test_nothing_is_loaded_or_acknowledged_and_no_discovery_ends(self) -> None:
+        node: Any = None
+        assert not fastdds.end_discovery(node)
         assert not fastdds.is_present()
         assert not fastdds.load_profiles("<profiles/>")
         assert not fastdds.acknowledged(SimpleNamespace(pointer=1))

@@ -204,13 +204,13 @@ def test_a_middleware_that_loads_no_profile(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(fastdds, "LOAD_STRING", "no_such_function")
-    fastdds._load_profiles.cache_clear()
+    fastdds._load.cache_clear()
     try:
         with caplog.at_level("INFO", "rosasync"):
             configuration.configure(0)
             configuration.configure(0)
     finally:
-        fastdds._load_profiles.cache_clear()
+        fastdds._load.cache_clear()
     assert not configuration.heartbeats()
     assert caplog.text.count("does not load rosasync's profile") == 1
 

@@ -3,34 +3,17 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import pytest
-import rclpy
-from rclpy.context import Context
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 
 from rosasync import Session
 from rosasync._ros import fastdds
 from tests.support.echo import ECHO
+from tests.support.nodes import borrowed_node
 from tests.support.servers import ServerProcess
 from tests.support.times import TICK, until
-
-
-@contextmanager
-def stock_node(name: str) -> Iterator[Node]:
-    """A node of rclpy in a context of its own."""
-    context = Context()
-    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
-    node = Node(name, context=context)
-    try:
-        yield node
-    finally:
-        node.destroy_node()
-        context.try_shutdown()
 
 
 def sees(node: Node, name: str) -> bool:
@@ -38,12 +21,11 @@ def sees(node: Node, name: str) -> bool:
 
 
 async def test_a_node_discovers_nothing_more(session: Session, server: ServerProcess) -> None:
-    with stock_node("deaf") as deaf, stock_node("other") as other:
+    with borrowed_node("deaf") as deaf, borrowed_node("other") as other:
         await server.serve("/early")
         await until(lambda: sees(deaf, "/early"))
-        with deaf.handle:
-            assert fastdds.end_discovery(deaf.handle)
-            assert fastdds.end_discovery(deaf.handle), "once more"
+        assert fastdds.end_discovery(deaf)
+        assert fastdds.end_discovery(deaf), "once more"
         await server.serve("/late")
         await session.wait_for_service(ECHO, "/late")
         await until(lambda: sees(other, "/late"))
@@ -66,7 +48,7 @@ async def test_a_session_ends_the_discovery_of_its_own_context(
 async def test_the_other_nodes_of_a_given_context_go_on_discovering(
     bridge: Any, server: ServerProcess
 ) -> None:
-    with stock_node("other") as other:
+    with borrowed_node("other") as other:
         async with Session("guest", context=other.context, bridge=bridge):
             pass
         await server.serve("/late")

@@ -324,8 +324,7 @@ def spinning(node: Any, executor: Any) -> Iterator[None]:
         from rosasync._ros import fastdds
 
         # Otherwise it hung below, twice in about 300 times that four processes ended together.
-        with node.handle:
-            fastdds.end_discovery(node.handle)
+        fastdds.end_discovery(node)
         rclpy.try_shutdown()
         thread.join()
         executor.shutdown()

@@ -6,10 +6,15 @@ Whether the middleware is Fast DDS is decided by what its library offers, not by
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Callable
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from rclpy.exceptions import InvalidHandle
 from rclpy.utilities import get_rmw_implementation_identifier
+
+if TYPE_CHECKING:
+    from rclpy.node import Node
 
 __all__ = ["acknowledged", "end_discovery", "is_present", "load_profiles"]
 
@@ -52,24 +57,19 @@ class Duration(ctypes.Structure):
 
 
 class Acknowledgements:
-    """The three functions that lead from a service to the acknowledgements of its responses."""
+    """The functions that lead from a service to the acknowledgements of its responses."""
 
     def __init__(self) -> None:
-        self._rmw_service = ctypes.CDLL("librcl.so").rcl_service_get_rmw_handle
-        name = get_rmw_implementation_identifier()
-        rmw = ctypes.CDLL(f"lib{name}.so")
-        self._writer = getattr(rmw, RESPONSE_WRITER.format(length=len(name), rmw=name))
+        self._writer = _getter("rcl_service_get_rmw_handle", RESPONSE_WRITER)
+        rmw = _library()
         # The symbols of the libraries that it is linked with are found too.
         (self._wait,) = (getattr(rmw, name) for name in WAITS if hasattr(rmw, name))
-        for function in (self._rmw_service, self._writer):
-            function.argtypes = [ctypes.c_void_p]
-            function.restype = ctypes.c_void_p
         self._wait.argtypes = [ctypes.c_void_p, ctypes.POINTER(Duration)]
         self._wait.restype = ctypes.c_uint32
 
     def complete(self, pointer: int) -> bool:
         """Return whether all responses of an ``rcl_service_t`` were acknowledged; does not wait."""
-        writer = self._writer(self._rmw_service(pointer))
+        writer = self._writer(pointer)
         return bool(writer) and self._wait(writer, Duration()) == 0
 
 
@@ -82,32 +82,26 @@ def acknowledged(service: Any) -> bool:
     Returns:
         False also if this middleware cannot tell.
     """
-    acknowledgements = _load()
-    return acknowledgements is not None and acknowledgements.complete(service.pointer)
+    acknowledgements = _load(Acknowledgements)
+    return acknowledgements is not None and bool(acknowledgements.complete(service.pointer))
 
 
 class Participants:
-    """The three functions that lead from a node to the listener of its participant."""
+    """The functions that lead from a node to the listener of its participant."""
 
     def __init__(self) -> None:
-        self._rmw_node = ctypes.CDLL("librcl.so").rcl_node_get_rmw_handle
-        name = get_rmw_implementation_identifier()
-        rmw = ctypes.CDLL(f"lib{name}.so")
-        self._participant = getattr(rmw, PARTICIPANT.format(length=len(name), rmw=name))
-        self._set_listener = getattr(rmw, SET_LISTENER)
-        for function in (self._rmw_node, self._participant):
-            function.argtypes = [ctypes.c_void_p]
-            function.restype = ctypes.c_void_p
+        self._participant = _getter("rcl_node_get_rmw_handle", PARTICIPANT)
+        self._set_listener = getattr(_library(), SET_LISTENER)
         self._set_listener.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64]
         self._set_listener.restype = ctypes.c_uint32
 
     def end_discovery(self, pointer: int) -> bool:
         """Remove the listener of the participant of an ``rcl_node_t``; waits while it is called."""
-        participant = self._participant(self._rmw_node(pointer))
+        participant = self._participant(pointer)
         return bool(participant) and self._set_listener(participant, None, LISTENER_TIMEOUT) == 0
 
 
-def end_discovery(node: Any) -> bool:
+def end_discovery(node: Node) -> bool:
     """End the discovery of a node's context, so that its participant can be destroyed safely.
 
     rmw_fastrtps removes the listener of a participant before it destroys it, and waits without a
@@ -118,20 +112,27 @@ def end_discovery(node: Any) -> bool:
     the listener is gone, there is no call to wait for.
 
     Args:
-        node: the handle of an rclpy node, in use.
+        node: the node. If it was destroyed, there is nothing to do.
 
     Returns:
-        False if a call did not end within `LISTENER_TIMEOUT`, or this is not Fast DDS.
+        Whether it has ended. False if a call did not end within `LISTENER_TIMEOUT`, or this is not
+        Fast DDS.
     """
-    participants = _load_participants()
-    return participants is not None and participants.end_discovery(node.pointer)
+    participants = _load(Participants)
+    if participants is None:
+        return False
+    try:
+        with node.handle:
+            return bool(participants.end_discovery(node.handle.pointer))
+    except InvalidHandle:
+        return False
 
 
 class Profiles:
     """The profiles of this process, in the factory that makes its participants."""
 
     def __init__(self) -> None:
-        rmw = ctypes.CDLL(f"lib{get_rmw_implementation_identifier()}.so")
+        rmw = _library()
         get_factory = getattr(rmw, GET_FACTORY)
         get_factory.restype = ctypes.c_void_p
         self._factory = ctypes.c_void_p(get_factory())
@@ -171,38 +172,43 @@ def load_profiles(text: str) -> bool:
     Returns:
         Whether Fast DDS has accepted them; False also if this middleware has none.
     """
-    profiles = _load_profiles()
-    return profiles is not None and profiles.load(text)
+    profiles = _load(Profiles)
+    return profiles is not None and bool(profiles.load(text))
 
 
 @cache
 def is_present() -> bool:
     """Return whether this middleware is Fast DDS: whether its library has the factory."""
     try:
-        return hasattr(ctypes.CDLL(f"lib{get_rmw_implementation_identifier()}.so"), GET_FACTORY)
+        return hasattr(_library(), GET_FACTORY)
     except OSError:
         return False
 
 
 @cache
-def _load_participants() -> Participants | None:
+def _load(functions: Callable[[], Any]) -> Any:
+    """Make one of the classes of functions; None if this middleware lacks one of them."""
     try:
-        return Participants()
+        return functions()
     except (OSError, AttributeError, ValueError):
         return None
 
 
-@cache
-def _load_profiles() -> Profiles | None:
-    try:
-        return Profiles()
-    except (OSError, AttributeError, ValueError):
-        return None
+def _library() -> ctypes.CDLL:
+    return ctypes.CDLL(f"lib{get_rmw_implementation_identifier()}.so")
 
 
-@cache
-def _load() -> Acknowledgements | None:
-    try:
-        return Acknowledgements()
-    except (OSError, AttributeError, ValueError):
-        return None
+def _getter(get_handle: str, symbol: str) -> Callable[[int], int | None]:
+    """Return the function that leads from an entity of rcl to what Fast DDS has for it.
+
+    Args:
+        get_handle: the function of librcl that returns the middleware's handle of the entity.
+        symbol: the function of the middleware that takes this handle, without its namespace.
+    """
+    name = get_rmw_implementation_identifier()
+    to_handle = getattr(ctypes.CDLL("librcl.so"), get_handle)
+    to_entity = getattr(_library(), symbol.format(length=len(name), rmw=name))
+    for function in (to_handle, to_entity):
+        function.argtypes = [ctypes.c_void_p]
+        function.restype = ctypes.c_void_p
+    return lambda pointer: to_entity(to_handle(pointer))

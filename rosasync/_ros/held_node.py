@@ -91,8 +91,7 @@ class HeldNode:
             self.node.executor = None
         if self._own_context is not None:
             # Not in a context that was given: its other nodes go on discovering.
-            with contextlib.suppress(InvalidHandle), self.node.handle:
-                fastdds.end_discovery(self.node.handle)
+            fastdds.end_discovery(self.node)
         if self._own:
             self.node.destroy_node()
         self._shut_context_down()
