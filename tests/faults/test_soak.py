@@ -56,7 +56,7 @@ class Network:
         caller = CallerProcess(lease=LEASE, **self._on("client"))
         return await self._stack.enter_async_context(caller)
 
-    async def restart(self, how: Callable[[ServerProcess], None]) -> None:
+    async def restart(self, how: Callable[[ServerProcess], object]) -> None:
         number = self.chance.randrange(2)
         await asyncio.to_thread(how, self._servers[number])
         await asyncio.sleep(self.chance.uniform(0, PAUSE))

@@ -127,10 +127,8 @@ class Child:
                 raise self._ended() from None
             ready, _, _ = select.select([self._answers], [], [], patience)
             if not ready:
-                self._write_stacks()
                 late = Unanswered(f"{self.module} did not answer {command!r} in {patience:g} s")
-                late.add_note("\n".join(self._logged()))
-                self._reap()
+                late.add_note("\n".join(self.kill(stacks=True)))
                 raise late
             line = self._answers.readline()
         if not line:
@@ -146,15 +144,25 @@ class Child:
         """Send it a signal."""
         self._process.send_signal(number)
 
-    def kill(self, *, stacks: bool = False) -> None:
+    def kill(self, *, stacks: bool = False) -> list[str]:
         """End it as a crash does (SIGKILL), with every process that it started.
 
         Args:
             stacks: write its threads' stacks to its stderr before.
+
+        Returns:
+            The lines that it has written, if it is quiet and was not ended before.
         """
         if stacks:
-            self._write_stacks()
+            self.signal(signal.SIGABRT)
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(LIMIT / 4)
+        lines = []
+        if self._log is not None and not self._log.closed:
+            self._log.seek(0)
+            lines = self._log.read().decode(errors="replace").strip().splitlines()
         self._reap()
+        return lines
 
     def interrupt(self) -> None:
         """End it as Ctrl-C does (SIGINT)."""
@@ -175,18 +183,6 @@ class Child:
         """Called by `close` if the child does not end."""
         self.kill(stacks=True)
 
-    def _write_stacks(self) -> None:
-        self.signal(signal.SIGABRT)
-        with suppress(subprocess.TimeoutExpired):
-            self._process.wait(LIMIT / 4)
-
-    def _logged(self) -> list[str]:
-        """Return the lines that it has written, if it is quiet."""
-        if self._log is None:
-            return []
-        self._log.seek(0)
-        return self._log.read().decode(errors="replace").strip().splitlines()
-
     def _reap(self) -> None:
         with suppress(ProcessLookupError):
             os.killpg(self.pid, signal.SIGKILL)
@@ -201,8 +197,7 @@ class Child:
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(LIMIT)
         code = self._process.poll()
-        last = self._logged()[-3:]
-        self.kill()
+        last = self.kill()[-3:]
         return ChildError(" / ".join((f"{self.module} ended with code {code}", *last)))
 
     @property

@@ -153,16 +153,20 @@ class NodeProcess(Child):
             self.restart()
             return self.ask_now(command, **arguments)
 
-    def kill(self, *, stacks: bool = False) -> None:
+    def kill(self, *, stacks: bool = False) -> list[str]:
         """End it as a crash does (SIGKILL), and remove the shared memory it leaves behind.
 
         Args:
             stacks: write its threads' stacks to stderr before.
+
+        Returns:
+            The lines that it has written, if it is quiet and was not ended before.
         """
         leftovers = self._shared_memory()
-        super().kill(stacks=stacks)
+        lines = super().kill(stacks=stacks)
         for file in leftovers:
             file.unlink(missing_ok=True)
+        return lines
 
     def _hangs(self) -> None:
         super()._hangs()
