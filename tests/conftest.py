@@ -18,7 +18,8 @@ import pytest
 import uvloop
 from hypothesis import HealthCheck, settings
 
-from rosasync import Session
+from rosasync import Limits, Session
+from rosasync._client import response_times
 from rosasync._ros.domain import isolate
 from rosasync._ros.shared_memory import unfinished_ports
 from tests.faults.table import pytest_terminal_summary
@@ -121,6 +122,17 @@ async def session(bridge: Bridge) -> AsyncIterator[Session]:
     async with Session("test_client", bridge=bridge, timeout=2 * LIMIT) as session:
         yield session
     assert session.closed
+
+
+@pytest.fixture
+async def patient_session(
+    bridge: Bridge, monkeypatch: pytest.MonkeyPatch
+) -> AsyncIterator[Session]:
+    """A session in which abandoned requests keep their places, however slow the machine is."""
+    monkeypatch.setattr(response_times, "PATIENCE_INITIAL", LIMIT)
+    limits = Limits(grace=4 * LIMIT)
+    async with Session("patient", bridge=bridge, limits=limits, timeout=2 * LIMIT) as session:
+        yield session
 
 
 class _Processes:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
 from typing import TYPE_CHECKING
 
 import anyio
@@ -11,7 +10,6 @@ import pytest
 import uvloop
 
 from rosasync import (
-    Limits,
     QueueTimeout,
     ResponseTimeout,
     ServerGone,
@@ -19,7 +17,6 @@ from rosasync import (
     Session,
     SessionClosed,
 )
-from rosasync._client import response_times
 from tests.support.checks import assert_clean, check_call
 from tests.support.echo import ECHO, answer_to, request_of
 from tests.support.times import LIMIT, TICK, until
@@ -47,17 +44,8 @@ async def test_calls_one_at_a_time_and_at_once(session: Session, echo: str) -> N
     await assert_clean(session)
 
 
-@pytest.fixture
-async def patient(bridge: Bridge, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Session]:
-    """A session in which abandoned requests keep their places, however slow the machine is."""
-    monkeypatch.setattr(response_times, "PATIENCE_INITIAL", LIMIT)
-    limits = Limits(grace=LIMIT)
-    async with Session("patient", bridge=bridge, limits=limits, timeout=2 * LIMIT) as session:
-        yield session
-
-
-async def test_deadlines_and_cancellation(patient: Session, server: ServerProcess) -> None:
-    session = patient
+async def test_deadlines_and_cancellation(patient_session: Session, server: ServerProcess) -> None:
+    session = patient_session
     with pytest.raises(ServiceUnavailable):
         await session.call(ECHO, "/absent", timeout=TICK)
     await server.serve("/echo", delay="hold")

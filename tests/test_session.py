@@ -6,7 +6,6 @@ import asyncio
 import math
 import threading
 import time
-from collections.abc import AsyncIterator
 from typing import TYPE_CHECKING, Any
 
 import anyio
@@ -18,7 +17,6 @@ from std_srvs.srv import Empty, SetBool, Trigger
 
 from rosasync import (
     InvalidServiceName,
-    Limits,
     ResponseTimeout,
     Retry,
     ServiceUnavailable,
@@ -248,16 +246,10 @@ async def test_a_session_in_each_of_two_loops(bridge: Bridge, echo: str) -> None
             group.create_task(asyncio.to_thread(asyncio.run, program(name)))
 
 
-@pytest.fixture
-async def patient(bridge: Bridge) -> AsyncIterator[Session]:
-    """A session in which abandoned requests keep their places for longer than a test takes."""
-    limits = Limits(grace=4 * LIMIT)
-    async with Session("patient", bridge=bridge, limits=limits, timeout=2 * LIMIT) as session:
-        yield session
-
-
-async def test_anyios_deadlines_and_task_groups(patient: Session, server: ServerProcess) -> None:
-    session = patient
+async def test_anyios_deadlines_and_task_groups(
+    patient_session: Session, server: ServerProcess
+) -> None:
+    session = patient_session
     await server.serve("/echo")
     await server.serve("/never", delay="never")
     await check_call(session, "/echo", "warm")
