@@ -11,7 +11,7 @@ import signal
 import threading
 import warnings
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from typing import Literal
 
 import pytest
@@ -207,14 +207,28 @@ def lamp() -> Iterator[ServerProcess]:
         yield server
 
 
-@pytest.fixture(scope="module")
-def own_domain() -> Iterator[None]:
-    """A ROS domain for one module: its child processes see no node of another test."""
+@contextmanager
+def _another_domain() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for name in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE"):
             patch.setenv(name, os.environ[name])
         isolate()
         yield
+
+
+@pytest.fixture(scope="module")
+def own_domain() -> Iterator[None]:
+    """A ROS domain for one module: its child processes see no node of another test."""
+    with _another_domain():
+        yield
+
+
+@pytest.fixture
+def lonely_echo() -> Iterator[str]:
+    """The name of a stock service that echoes, in a ROS domain for one test."""
+    with _another_domain(), ServerProcess() as server:
+        server.serve_now("/echo")
+        yield "/echo"
 
 
 @pytest.fixture

@@ -244,7 +244,7 @@ async def test_a_client_in_use_is_not_destroyed(bridge: Bridge, server: ServerPr
 
 @pytest.mark.parametrize("services", [100, pytest.param(1000, marks=pytest.mark.soak)])
 async def test_a_thousand_services_leave_no_thread_or_file_behind(
-    bridge: Bridge, echo: str, services: int
+    bridge: Bridge, lonely_echo: str, services: int
 ) -> None:
     limits = Limits(idle=10 * TICK)
     async with Session("thousand", bridge=bridge, limits=limits, timeout=LIMIT) as session:
@@ -255,7 +255,7 @@ async def test_a_thousand_services_leave_no_thread_or_file_behind(
             )
             await until(lambda: session.pool.statistics().clients == 0, 4 * LIMIT)
 
-        await check_call(session, echo, "before")
+        await check_call(session, lonely_echo, "before")
         await pool_and_evict(50)
         # Each process that is discovered takes descriptors.
         await until(lambda: all_discovered(session.node))
@@ -265,7 +265,7 @@ async def test_a_thousand_services_leave_no_thread_or_file_behind(
         await until(lambda: not list(session.node.clients), 4 * LIMIT)
         assert count_threads() == threads
         assert count_descriptors() == descriptors
-        await check_call(session, echo, "after")
+        await check_call(session, lonely_echo, "after")
 
 
 async def test_clients_that_never_called_are_destroyed_too(bridge: Bridge) -> None:

@@ -21,7 +21,7 @@ from tests.support.echo import ECHO
 from tests.support.serving import FORMS, AnyCall, ask, echo_of, serving, settled
 from tests.support.times import LIMIT, TICK, until
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("own_domain")]
 
 numbers = itertools.count()
 
@@ -37,7 +37,7 @@ def rounds(few: int, *, soak: int) -> list[Any]:
 
 
 @pytest.fixture(scope="module")
-def crowd() -> Iterator[list[ClientProcess]]:
+def crowd(own_domain: None) -> Iterator[list[ClientProcess]]:
     """Four processes of stock clients."""
     with ExitStack() as stack:
         yield [stack.enter_context(ClientProcess()) for _ in range(PROCESSES)]

@@ -13,7 +13,8 @@ from tests.faults.trial import Trial
 from tests.support.hosts import own_shared_memory
 from tests.support.program import as_root, run_program
 
-pytestmark = pytest.mark.slow
+# The program waits until it has discovered every process of its domain.
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("own_domain")]
 
 SHARED = """
 import contextlib, gc, os, resource, subprocess, tempfile
