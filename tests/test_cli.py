@@ -68,7 +68,7 @@ def test_demo_without_rclpy_says_which_extra() -> None:
 
 
 def test_demo_prints_json_alone() -> None:
-    done = run(*ROSASYNC, "demo", "--json", "--calls", "200", "--seconds", "60")
+    done = run(*ROSASYNC, "demo", "--json", "--calls", "200", "--seconds", "600")
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
     assert report["bridge"] in {"direct", "executor"}

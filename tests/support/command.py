@@ -37,9 +37,8 @@ DISCOVERY = "10"
 
 A process announces itself every 3 s, and a busy machine may lose that or let it wait.
 """
-LOOK = ("--wait", "6")
-"""Options with which a command surely discovers the nodes of `tests.support.process.NodeProcess`,
-which announce themselves twice a second; by itself it looks for 3.5 s at most."""
+LOOK = ("--wait", DISCOVERY)
+"""Options with which a command surely discovers the nodes; by itself it looks for 3.5 s at most."""
 PATIENCE = 10.0
 """Seconds in which a command that is ended may clean up."""
 COLUMNS, LINES = 100, 30

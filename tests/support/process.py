@@ -1,4 +1,4 @@
-"""Processes of nodes for the tests, which other nodes find at once, and the ends of programs."""
+"""Processes of nodes for the tests, and the ends of programs."""
 
 from __future__ import annotations
 
@@ -29,14 +29,13 @@ _PROFILE_VARIABLE = (
     else "FASTDDS_DEFAULT_PROFILES_FILE"
 )
 
-# Every test opens new sessions. A process that announces itself twice a second instead of every
-# 3 s is found at once, even by a session that replaces another. A response waits up to 3 s for its
-# client to be matched: if a discovery packet is lost, the usual 0.1 s is not enough.
+# A response waits up to 3 s for its client to be matched: if a discovery packet is lost, the usual
+# 0.1 s is not enough.
 _PROFILE = """<?xml version="1.0" encoding="UTF-8" ?>
 <profiles xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
   <participant profile_name="child" is_default_profile="true"><rtps><builtin><discovery_config>
-    <leaseDuration><sec>{seconds}</sec></leaseDuration>
-    <leaseAnnouncement><sec>0</sec><nanosec>{announcement}</nanosec></leaseAnnouncement>
+    <leaseDuration><sec>{lease}</sec></leaseDuration>
+    <leaseAnnouncement><sec>{seconds}</sec><nanosec>{nanoseconds}</nanosec></leaseAnnouncement>
   </discovery_config></builtin></rtps></participant>
   <publisher profile_name="service"><qos><reliability>
     <max_blocking_time><sec>3</sec></max_blocking_time>
@@ -52,6 +51,10 @@ if it is removing an endpoint at that moment, as it does when a test ends its se
 (https://github.com/eProsima/Fast-DDS/issues/6502). The stacks of a stock process that answered no
 more, in one of nine runs of its module beside load, showed that.
 """
+ANNOUNCEMENT = 3 * 10**9
+"""Nanoseconds between two announcements of a child, as usual. At each there is the same deadlock: a
+stock server that announced itself twice a second was found in it.
+"""
 
 
 @contextmanager
@@ -59,8 +62,8 @@ def profile(lease: int = LEASE) -> Iterator[dict[str, str]]:
     """Write the middleware's profile for a child; yield the variable that names it."""
     with TemporaryDirectory() as folder:
         file = Path(folder) / "profile.xml"
-        announcement = min(lease * 200_000_000, 500_000_000)
-        file.write_text(_PROFILE.format(seconds=lease, announcement=announcement))
+        seconds, nanoseconds = divmod(min(lease * 10**9 // 5, ANNOUNCEMENT), 10**9)
+        file.write_text(_PROFILE.format(lease=lease, seconds=seconds, nanoseconds=nanoseconds))
         yield {_PROFILE_VARIABLE: str(file)}
 
 
@@ -95,7 +98,7 @@ def ended(process: subprocess.Popen[AnyStr]) -> Iterator[subprocess.Popen[AnyStr
 
 
 class NodeProcess(Child):
-    """A child process that runs one of the modules beside this one, and announces itself often.
+    """A child process that runs one of the modules beside this one.
 
     Args:
         lease: seconds after which other processes notice that this one was killed.
