@@ -142,6 +142,7 @@ class _Processes:
         self._server: ServerProcess | None = None
         self._client: ClientProcess | None = None
         self._actions: ActionServerProcess | None = None
+        self._lamp: ServerProcess | None = None
 
     def server(self) -> ServerProcess:
         if self._server is None or not self._server.alive:
@@ -158,8 +159,17 @@ class _Processes:
             self._actions = ActionServerProcess()
         return self._actions
 
+    def lamp(self) -> ServerProcess:
+        if self._lamp is None or not self._lamp.works():
+            self._lamp = ServerProcess("lamp_server")
+            self._lamp.serve_now("/lamp/switch", "std_srvs/srv/SetBool")
+            self._lamp.serve_now("/lamp/silent", "std_srvs/srv/SetBool", delay="never")
+            self._lamp.serve_now("/lamp/text")
+            self._lamp.serve_now("/lamp/twice", "std_srvs/srv/SetBool", copies=2)
+        return self._lamp
+
     def close(self) -> None:
-        for child in (self._server, self._client, self._actions):
+        for child in (self._server, self._client, self._actions, self._lamp):
             if child is not None and child.alive:
                 child.close()
 
@@ -193,18 +203,13 @@ def action_server(processes: _Processes) -> Iterator[ActionServerProcess]:
             server.clear_now()
 
 
-@pytest.fixture(scope="session")
-def lamp() -> Iterator[ServerProcess]:
+@pytest.fixture
+def lamp(processes: _Processes) -> ServerProcess:
     """A process of stock servers for the command line: the tutorial's lamp, and others.
 
     ``/lamp/silent`` never answers, ``/lamp/text`` echoes, ``/lamp/twice`` has two servers.
     """
-    with ServerProcess("lamp_server") as server:
-        server.serve_now("/lamp/switch", "std_srvs/srv/SetBool")
-        server.serve_now("/lamp/silent", "std_srvs/srv/SetBool", delay="never")
-        server.serve_now("/lamp/text")
-        server.serve_now("/lamp/twice", "std_srvs/srv/SetBool", copies=2)
-        yield server
+    return processes.lamp()
 
 
 @contextmanager

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from rosasync._ros.discovery import own_ports
+from tests.support.child import ChildError
 from tests.support.echo import ECHO, fill, response_to, service_class
 from tests.support.executor import run_in, spin
 from tests.support.process import NodeProcess, ended, profile
@@ -116,6 +117,16 @@ class ServerProcess(NodeProcess):
             return
         self.ask_first("serve", patience=REPLACED_AFTER, **arguments)
         self._serving = True
+
+    def works(self) -> bool:
+        """Return whether it can still make something in the middleware; blocks.
+
+        For one that is kept from test to test with its services. It may hang there (see `restart`),
+        and is ended then.
+        """
+        with suppress(ChildError):
+            self.ask_now("touch", patience=REPLACED_AFTER)
+        return self.alive
 
     async def stop(self, name: str) -> None:
         """Destroy the services of this name."""
@@ -313,6 +324,14 @@ class _Servers:
             service.changed.wait_for(lambda: service.answered >= at_least, LIMIT)
             assert service.answered >= at_least, f"{service.answered} < {at_least}"
             return service.answered
+
+    def touch(self) -> None:
+        from std_msgs.msg import Empty
+
+        def touch() -> None:
+            self._node.destroy_publisher(self._node.create_publisher(Empty, "/_touched", 1))
+
+        run_in(self._executor, touch)
 
     def clear(self) -> None:
         for name in self._services:
